@@ -9,7 +9,7 @@ import numpy as np
 MAX_MODEL_ERROR = 0.5  # of a figure of the model: half of it
 
 Extreme = Literal["target", "start"]
-"""What is placed where the tasks themselves never do: the target out of reach, or the robot in a corner."""
+"""Placements outside the task: the target out of reach, or the robot in a corner."""
 
 
 class SensorError(NamedTuple):

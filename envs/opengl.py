@@ -21,7 +21,7 @@ class CannotDrawError(RuntimeError):
 
 
 def has_display() -> bool:
-    """Try to open a window, an invisible one. MuJoCo ends or aborts the whole process where it cannot."""
+    """Try to open a window, an invisible one. MuJoCo ends or aborts the whole process if it cannot."""
     if not sys.platform.startswith("linux"):
         return True
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

@@ -1,4 +1,4 @@
-"""Domain randomisation: what a real robot adds to a simulator, drawn anew for each episode.
+"""Domain randomisation: what a real robot adds to a simulator, drawn for each episode.
 
 A wrapper for every Gymnasium environment: delays and losses need nothing of it, noise a vector of numbers, the rest an
 environment of this package or one with the methods in `disturbances.py`.

@@ -72,7 +72,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return np.zeros((0, 3))
 
     def move_obstacle(self, index: int, position: ArrayLike) -> None:
-        """Put an obstacle somewhere else within the episode. Raises ValueError where there is none of that number."""
+        """Put an obstacle somewhere else within the episode. Raises ValueError if there is none of that number."""
         raise ValueError(f"{type(self).__name__} has no obstacle {index} to move to {np.asarray(position).tolist()}")
 
     def viewpoint(self) -> tuple[Vector, Vector]:
@@ -145,7 +145,7 @@ class Camera:
     def show(self) -> None:
         """Open the viewer window at the first call, refresh it at the next ones.
 
-        Raises CannotDrawError where there is no display.
+        Raises CannotDrawError if there is no display.
         """
         if self._viewer is None:
             if not has_display():
@@ -178,7 +178,7 @@ class Camera:
 
 
 class _Picture:
-    """What one camera draws into, off screen. `mujoco.Renderer` could not: it takes no OpenGL context of our choice."""
+    """Off-screen buffer of one camera. `mujoco.Renderer` could not: it takes no OpenGL context of our choice."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         self._model = model

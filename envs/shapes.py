@@ -37,7 +37,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Poses:
-    """Where bodies are in the world, a row each."""
+    """Positions of bodies in the world, a row each."""
 
     positions: Vector  # [m], (n, 3)
     wxyz: Vector  # (n, 4)

@@ -69,7 +69,7 @@ def argument_parser() -> argparse.ArgumentParser:
         description="Learn the next version of a policy from recordings.", formatter_class=DefaultsFormatter
     )
     parser.add_argument("recordings", nargs="+", type=Path, help="recordings (.mcap), or folders of them")
-    parser.add_argument("--policy", help="which recorded policy, by name; needed where there are several")
+    parser.add_argument("--policy", help="name of the recorded policy; required if there are several")
     parser.add_argument("--run", choices=ALGORITHMS, default="MARWIL", help="RLlib's algorithm")
     parser.add_argument("--from", type=Path, dest="start", metavar="CHECKPOINT", help="checkpoint to go on from")
     parser.add_argument("--out", type=Path, required=True, help="new folder for the checkpoint")

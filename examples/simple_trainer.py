@@ -111,13 +111,13 @@ def argument_parser() -> argparse.ArgumentParser:
 
     faults = parser.add_argument_group("when something fails")
     bool_flag = argparse.BooleanOptionalAction
-    faults.add_argument("--restart-failed-env-runners", action=bool_flag, default=True, help="start a lost one anew")
+    faults.add_argument("--restart-failed-env-runners", action=bool_flag, default=True, help="restart a lost one")
     faults.add_argument("--ignore-env-runner-failures", action=bool_flag, default=False, help="go on with the others")
     faults.add_argument(
         "--restart-failed-sub-environments", action=bool_flag, default=False, help="remake a crashed one"
     )
     faults.add_argument("--max-num-env-runner-restarts", type=int, default=1000, help="then the training fails")
-    faults.add_argument("--max-failures", type=int, default=0, help="times a failed trial goes on from its checkpoint")
+    faults.add_argument("--max-failures", type=int, default=0, help="how often a trial continues from its checkpoint")
 
     group = parser.add_argument_group("what is written")
     group.add_argument("--storage", type=Path, default=Path("runs"), help="folder for results and checkpoints")

@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("stops", nargs="*", metavar="STOP", help="cartpole, frozenlake, ur5 (default: all three)")
     parser.add_argument("--out", type=Path, default=Path("tour"), help="folder for runs, bundles and videos")
     parser.add_argument("--quick", action="store_true", help="train for moments only")
-    parser.add_argument("--no-video", action="store_true", help="where there is no OpenGL")
+    parser.add_argument("--no-video", action="store_true", help="draw nothing, without OpenGL")
     args = parser.parse_args()
     stops: dict[str, Callable[[Settings], None]] = {"cartpole": cartpole, "frozenlake": frozen_lake, "ur5": ur5}
     if unknown := [stop for stop in args.stops if stop not in stops]:

@@ -1,6 +1,6 @@
 """Names and units of observation and action elements, read from the environment's class.
 
-An environment tells by a classmethod `describe(**env_config)` that returns
+An environment names them by a classmethod `describe(**env_config)` that returns
 `{"observation": [{"name", "unit"}, ...], "action": [...], "control_rate_hz": 10.0}`. Names help people and change
 nothing about the policy, so whatever is missing or wrong here is a notice and not an error.
 """

@@ -1,6 +1,6 @@
 """`rlservo export`: restore a checkpoint, build the graph, prove it, and only then name the bundle.
 
-Everything is written into a temporary folder beside the target, which is renamed at the end or removed: a bundle is
+Everything is written into a temporary folder next to the target, which is renamed at the end or removed: a bundle is
 there whole or not at all.
 """
 
@@ -70,7 +70,7 @@ TORCH = ("torch", "onnx", "onnxscript", "gymnasium")
 
 
 def silent(_sentence: str) -> None:
-    """Show nobody how far a command is."""
+    """Show no progress."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ def export_all_modules(
 ) -> list[ExportResult]:
     """Export every policy of a checkpoint, each to `out/<name>-<module id>/<version>/`: all of them, or none.
 
-    A module that is no network but a script is left out, which `notify` is told.
+    A module that is a script and not a network is left out and reported to `notify`.
     A module whose agents are treated differently gives a bundle an agent, `<name>-<module id>-<agent id>`. The rest is
     as for `export_checkpoint`.
     """
@@ -284,7 +284,7 @@ def _check_filter(files: PolicyFiles, facts: CheckpointFacts, restored: Restored
 
 @contextlib.contextmanager
 def _temporary_folder(target: Path) -> Iterator[Path]:
-    """Give a folder beside `target`; whatever happens, it and the parents made for it are gone or in use afterwards."""
+    """Give a folder next to `target`; it and the parents made for it are always gone or in use afterwards."""
     made = [parent for parent in (target.parent, target.parent.parent) if not parent.exists()]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -306,7 +306,7 @@ def _write_graphs(
 ) -> tuple[Parity, Inputs, Outputs]:
     """Write both formats, prove them, and return the proof and the golden vectors.
 
-    Parts of the observation that nothing reads are no inputs of theirs.
+    Parts of the observation that nothing reads are not inputs.
     """
     from rlservo.export.graph.onnx_file import inputs_read, run_onnx, write_onnx
     from rlservo.export.graph.policy_graph import PolicyGraph

@@ -33,7 +33,7 @@ def prune_checkpoint(
     Of an old-stack checkpoint that is the policy's state, as it is: one pickle that also holds optimizer and settings,
     and cannot be taken apart without becoming another file. The copy exports to the same policy, with the same hash; a
     new-stack one cannot be trained further (the optimizer stays behind).
-    Returns the files kept, relative to `dst`. `notify` is told what was kept, and of any file that names the home
+    Returns the files kept, relative to `dst`. `notify` gets what was kept, and of any file that names the home
     folder. Raises CheckpointError or UnsupportedError for `src`, UsageError when `dst` exists.
     """
     with fetch(src, silent) as local:
@@ -42,7 +42,7 @@ def prune_checkpoint(
 
 def _prune(files: Files, target: Path, app_dir: str | Path, notify: Callable[[str], None]) -> list[Path]:
     if target.exists():
-        raise UsageError(f"{target} exists already: give a folder that does not, to prune into")
+        raise UsageError(f"{target} exists already: give a new folder to prune into")
     notify(f"loading {files.root}: {PICKLES}")
     with user_code(app_dir):
         facts = read_facts(files.root, notify)

@@ -13,7 +13,7 @@ from rlservo.export.contract.contract import contract_json
 def renumber(bundle: Bundle, version: str, out: Path) -> Bundle:
     """Copy a bundle to `out/<name>/<version>/`; the number stands in its contract, and in the graph's copy of it.
 
-    Needs onnx. Raises UsageError for what is no version, and BundleError.
+    Needs onnx. Raises UsageError for an invalid version, and BundleError.
     """
     from rlservo.export.graph.onnx_file import add_metadata
 

@@ -205,7 +205,7 @@ def _filter(contract: Contract) -> BakedStep | None:
 
 
 def _seen(frozen: BakedStep | None, size: int) -> tuple[Sequence[Any], Sequence[Any]]:
-    """Return the filter's (mean, std) where they fit the observation, else two empty lists."""
+    """Return the filter's (mean, std) if they fit the observation, else two empty lists."""
     if frozen is None:
         return (), ()
     mean, std = frozen.values.get("mean"), frozen.values.get("std")

@@ -41,7 +41,7 @@ SEED = 20241  # not the export's: other observations
 
 @dataclass(frozen=True)
 class VerifyResult:
-    """What was found; the evaluation is in the bundle's contract as well."""
+    """Result of a verification; the evaluation is also in the bundle's contract."""
 
     parity: Parity
     evaluation: Evaluation | None

@@ -44,7 +44,7 @@ class ActingPolicy(Closeable, Protocol):
 
     @property
     def contract(self) -> Contract:
-        """What goes in and what comes out: spaces, element names and units, control rate."""
+        """Inputs and outputs: spaces, element names and units, control rate."""
         ...
 
     def act(self, obs: Observation, *, explore: bool = False, seed: int | None = None) -> Any:

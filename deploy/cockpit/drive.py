@@ -58,7 +58,7 @@ class Drive:
     ) -> None:
         """Open the policy and make the environment, by default the one it was trained in.
 
-        Raises UsageError where the two do not fit, and what `PolicySource.open` raises.
+        Raises UsageError if the two do not fit, and what `PolicySource.open` raises.
         """
         self._source = source
         self._choice, self._link = choice, Link()
@@ -116,7 +116,7 @@ class Drive:
     # -- commands, for `do`
 
     def play(self) -> None:
-        """Go on."""
+        """Continue."""
         self._phase, self._due = "driving", time.perf_counter()
 
     def pause(self) -> None:
@@ -132,7 +132,7 @@ class Drive:
             self.pause()
 
     def begin(self, start: Start, *, keep_target: bool = False) -> None:
-        """Begin an episode now; later ones that do not go on from where the robot is start alike."""
+        """Begin an episode now; later ones that do not continue from where the robot is start alike."""
         if start != "here":
             self._start = start
         self._is_users_target = self._is_users_target and keep_target
@@ -230,7 +230,7 @@ class Drive:
             self.view = self._view()
 
     def _guarded(self, command: Callable[[], None]) -> str:
-        """Run something; return what it raises in words: the thread goes on."""
+        """Run something; return what it raises in words: the thread continues."""
         try:
             command()
         except (RlservoError, ValueError) as error:
@@ -310,7 +310,7 @@ class Drive:
         try:
             policy = self._source.open(self._choice, self._link)
         except (UnavailableError, DeadlineError):
-            return  # the next request says so
+            return  # the next request reports it
         before, after = self._policy.contract, policy.contract
         if (before.name, before.version) == (after.name, after.version):
             policy.close()
@@ -358,7 +358,7 @@ class Drive:
         self._sentence = f"Episode {self._episodes + 1} runs."
 
     def _end(self, info: Mapping[str, Any], *, is_arrival: bool) -> None:
-        """Count an episode, and say how it goes on: from where the robot is, but after a failure."""
+        """Count an episode, and say how it continues: from where the robot is, but after a failure."""
         is_success, status = bool(success_of(info)), info.get("final_status")
         self._episodes += 1
         self._successes += is_success

@@ -16,7 +16,7 @@ class Ghost(Closeable):
     """A policy and a stage of its own; `close` closes both."""
 
     def __init__(self, policy: ActingPolicy, like: Stage) -> None:
-        """Build the same robot again. Raises UsageError where the policy does not fit it; then it is the caller's."""
+        """Build the same robot again. Raises UsageError if the policy does not fit it; then it is the caller's."""
         self.stage = Stage(like.env_id, like.arguments, policy.contract)
         self._policy = policy
         self._obs: Any = None

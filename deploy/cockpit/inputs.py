@@ -18,13 +18,13 @@ LOGGERS = ("asyncio", "websockets.server")  # that report what viser raises
 
 
 def number_of(slider: Any) -> float:
-    """Return a slider's value within its range; its lower end for what is no number."""
+    """Return a slider's value within its range; its lower end if it is not a number."""
     value = slider.value
     return float(min(max(value, slider.min), slider.max) if value == value else slider.min)
 
 
 def point_of(position: Any) -> Vector | None:
-    """Return a handle's position [m] (3,), or None for what is no place within a kilometre."""
+    """Return a handle's position [m] (3,), or None if it is not within a kilometre."""
     try:
         point = np.asarray(position, np.float64)
     except (TypeError, ValueError):
@@ -40,7 +40,7 @@ def checked_messages() -> Iterator[None]:
         logger.addFilter(_shorten)
     try:
         with warnings.catch_warnings():
-            # viser warns, and goes on with a position of two numbers, say, which later ends the drawing.
+            # viser warns, and continues with a position of two numbers, say, which later ends the drawing.
             warnings.filterwarnings("error", message=r"\[viser\] .* does not match annotation")
             yield
     finally:

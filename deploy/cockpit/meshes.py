@@ -1,6 +1,6 @@
 """Meshes of a scene: a MuJoCo model's shapes, laser beams and the floor's lines.
 
-They are small: where there is no graphics card, a frame takes as long as its triangles and its pixels do.
+They are small: if there is no graphics card, a frame takes as long as its triangles and its pixels do.
 """
 
 from __future__ import annotations

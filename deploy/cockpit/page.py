@@ -1,4 +1,4 @@
-"""The page: viser's server on loopback, and a loop that draws thirty times a second until it is told to stop."""
+"""The page: viser's server on loopback, and a loop that draws thirty times a second until it is stopped."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _phones: weakref.WeakSet[viser.ClientHandle] = weakref.WeakSet()
 
 
 class Shown(Protocol):
-    """What a page shows."""
+    """Content of a page."""
 
     def draw(self) -> None:
         """Draw a frame of the scene."""
@@ -67,14 +67,14 @@ class _Server(viser.ViserServer):
 
 @contextlib.contextmanager
 def served_page(port: int, title: str) -> Iterator[viser.ViserServer]:
-    """Serve an empty page until the block ends. Raises UsageError where the port is taken."""
+    """Serve an empty page until the block ends. Raises UsageError if the port is taken."""
     _check_port(port)
     with _silence(), _guarded_requests():  # its own banner names a port that ours names as well
         server = _Server(HOST, port, label=title, verbose=False)
     try:
         with checked_messages():
             server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=False)
-            # Shadows and reflections take five times as long to draw where there is no graphics card.
+            # Shadows and reflections take five times as long to draw if there is no graphics card.
             server.scene.configure_default_lights(cast_shadow=False)
             server.scene.configure_environment_map(None)
             server.scene.add_light_hemisphere("/sky", ground_color=(190, 190, 190), intensity=1.5)
@@ -109,7 +109,7 @@ def set_value(handle: Any, value: Any) -> None:
 
 
 def aim_cameras(server: viser.ViserServer, position: Vector, look_at: Vector) -> None:
-    """Let everybody who looks, and who will, stand there and look at that, as near as a browser's wider lens wants."""
+    """Place the camera of every present and future browser, closer for a wider lens."""
     position = look_at + NEARER * (position - look_at)
     server.initial_camera.position, server.initial_camera.look_at = position, look_at
     for client in server.get_clients().values():

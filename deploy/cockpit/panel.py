@@ -87,7 +87,7 @@ class DrivePanel:
             self._looks.start()
 
     def close(self) -> None:
-        """End what goes on beside the page."""
+        """End what runs besides the page."""
         self._is_closed.set()
         if self._looks.is_alive():
             self._looks.join()

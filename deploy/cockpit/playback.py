@@ -25,7 +25,7 @@ from rlservo.serve_app.replay.follower import Follower
 from rlservo.serve_app.replay.replay import Moment, replay
 
 MOST_EPISODES = 500  # in memory
-# What a recording does not tell where it stands is left out: the room and the cubes round a MiR100.
+# What a recording has no position for is left out: the room and the cubes round a MiR100.
 EMPTY_FLOOR = "rlservo/NoObstacleNavigationMir100Sim-v0"
 NO_MOMENT = "-"
 WAYS = {"Pause": 0, "Back": -1, "Step": 1}
@@ -35,10 +35,10 @@ class Tape:
     """Recorded episodes of one policy, and with a bundle what that would have done."""
 
     def __init__(self, path: Path, *, bundle: Path | None = None, policy: str | None = None) -> None:
-        """Raise UsageError where there is nothing to show, RecordingError where there is no recording."""
+        """Raise UsageError if there is nothing to show, RecordingError if there is no recording."""
         recording = Recording(path)
         self.differences: list[NDArray[Any]] = []
-        """Of the bundle's actions from the recorded ones, by episode; not a number where they are not known."""
+        """Of the bundle's actions from the recorded ones, by episode; NaN if they are not known."""
         self.moments: list[Moment] = []
         """Where they differ most."""
         self.episodes: list[Episode] = []
@@ -49,7 +49,7 @@ class Tape:
                 self.episodes.append(followed.episode)
                 if "action" not in followed.action:
                     raise UsageError(
-                        f"the actions of {followed.episode.policy.title} are nested: no robot of ours has such"
+                        f"the actions of {followed.episode.policy.title} are nested, which none of rlservo's robots has"
                     )
                 difference = followed.action["action"] - followed.episode.action["action"]
                 difference = difference.reshape(len(followed.episode), -1).astype(np.float64)
@@ -98,7 +98,7 @@ class PlaybackPanel:
     """The page's content for a recording."""
 
     def __init__(self, server: viser.ViserServer, tape: Tape, *, env_id: str | None) -> None:
-        """Raise UsageError where the recorded policy's environment is none that can be drawn."""
+        """Raise UsageError if the recorded policy's environment is none that can be drawn."""
         self._tape = tape
         contract = tape.contract
         home = env_id or home_of(contract)
@@ -131,7 +131,7 @@ class PlaybackPanel:
         aim_cameras(server, *self._stage.env.viewpoint())
 
     def draw(self) -> None:
-        """Draw a frame of the scene, and let time go on."""
+        """Draw a frame of the scene, and let time continue."""
         now = time.perf_counter()
         if self._is_playing:
             row = self._row + (now - self._last) / self._period_s * number_of(self._speed)

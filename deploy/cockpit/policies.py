@@ -21,7 +21,7 @@ FALLBACKS = (WAIT, "hold", "zero", "stop")
 
 @dataclass(frozen=True)
 class Link:
-    """How a server is asked for actions."""
+    """Transport and limits of requests to a server."""
 
     deadline_ms: float = 1000.0
     fallback: str = WAIT
@@ -36,7 +36,7 @@ class Choice:
 
 
 class PolicySource(Closeable, Protocol):
-    """Where policies come from."""
+    """Source of policies."""
 
     is_remote: bool
 
@@ -99,7 +99,7 @@ class BundledPolicies(PolicySource):
     is_remote = False
 
     def __init__(self, folder: Path) -> None:
-        """Raise BundleError where there is none."""
+        """Raise BundleError if there is none."""
         self._folders: dict[Choice, Path] = {}
         for bundle in find_bundles(folder):
             contract = read_contract(bundle)

@@ -52,7 +52,7 @@ class Elements:
         return cls(space)
 
     def deviations(self, values: Vector) -> Vector:
-        """Return how many standard deviations of the training values are from its mean; 0 where that is not known."""
+        """Return how many standard deviations of the training values are from its mean; 0 if that is not known."""
         if self.moments is None:
             return np.zeros(len(values))
         mean, std = self.moments
@@ -124,7 +124,7 @@ class Plot:
         )
 
     def update(self, x: Sequence[float], series: Sequence[Sequence[float] | Vector]) -> None:
-        """Show these values, a moment each; those that are not known are left out, and where none is, the plot."""
+        """Show these values over time; unknown ones are left out, and so is a plot without any."""
         columns = np.array([x, *series[: self._count]], np.float64)
         known = columns[:, np.isfinite(columns).all(axis=0)]
         self.visible = known.shape[1] > 0
@@ -143,7 +143,7 @@ class Plot:
 
 
 class Readings:
-    """Plots of what one policy did, and a table of what it sees, in a panel beside the scene."""
+    """Plots of what one policy did, and a table of what it sees, in a panel next to the scene."""
 
     def __init__(
         self, gui: viser.GuiApi, contract: Contract, difference: str = "Ghost's action minus the action"

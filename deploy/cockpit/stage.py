@@ -24,7 +24,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What `DomainRandomization` adds, the same in every episode."""
+    """Disturbances of `DomainRandomization`, the same in every episode."""
 
     action_latency: int = 0  # control cycles
     observation_latency: int = 0  # control cycles
@@ -34,7 +34,7 @@ class Disturbance:
 
 @dataclass(frozen=True)
 class Scene:
-    """Where things are at one moment."""
+    """Positions of all things at one moment."""
 
     poses: Poses  # of `moving_bodies`
     robot: Vector  # [m], (3,), what is to reach the target
@@ -47,13 +47,13 @@ class Stage:
     """One robot in one environment."""
 
     def __init__(self, env_id: str, arguments: Mapping[str, Any], contract: Contract | None = None) -> None:
-        """Raise UsageError where there is no such environment, it is none of ours, or the policy does not fit it."""
+        """Raise UsageError if there is no such environment, it is none of ours, or the policy does not fit it."""
         self.env_id, self.arguments = env_id, dict(arguments)
         self._made = make_env(env_id, self.arguments, render=False)
         env = self._made.unwrapped
         if not isinstance(env, RenderedEnv):
             self._made.close()
-            raise UsageError(f"the cockpit draws rlservo's own simulators (rlservo/...): {env_id} is none of them")
+            raise UsageError(f"the cockpit draws rlservo's own simulators (rlservo/...): {env_id} is not one of them")
         self.env = env
         self._bodies = moving_bodies(env.model)
         self._disturbed: DomainRandomization = DomainRandomization(self._made)
@@ -63,7 +63,7 @@ class Stage:
             self.cycle_s = 1.0 / (control_rate_of(self._made, self.arguments, contract) or 10.0)
 
     def check(self, contract: Contract) -> None:
-        """Raise UsageError where a policy's observations or actions are others than the environment's."""
+        """Raise UsageError if a policy's observations or actions are others than the environment's."""
         check_fit(contract, self._made, self.arguments)
 
     def disturb(self, disturbance: Disturbance) -> None:
@@ -84,7 +84,7 @@ class Stage:
         keep_target: bool = False,
         seed: int | None = None,
     ) -> Any:
-        """Begin an episode, with the robot at `position` where that is given, and return its first observation.
+        """Begin an episode, with the robot at `position` if that is given, and return its first observation.
 
         One that cannot start there starts as `start` says, and one that cannot start so as the task has it.
         """
@@ -122,7 +122,7 @@ class Stage:
 
 
 def home_of(contract: Contract) -> str:
-    """Return the environment that a policy was trained in, undisturbed. Raises UsageError where it is none of ours."""
+    """Return the environment that a policy was trained in, undisturbed. Raises UsageError if it is none of ours."""
     trained = contract.provenance
     env_id = trained.env_id and wrapped_env(trained.env_id, trained.env_config)[0]
     if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):

@@ -42,7 +42,7 @@ class View:
     ghost: tuple[Scene, Scene] | None
     ghost_contract: Contract | None
     phase: Phase
-    sentence: str  # what goes on
+    sentence: str  # what is being done
     trouble: str  # what is wrong, or nothing
     refusal: str  # why the last command was not followed, or nothing
     episodes: int

@@ -27,7 +27,7 @@ class WatchPanel:
     """The page's content for a robot server."""
 
     def __init__(self, server: viser.ViserServer, address: str, arguments: Mapping[str, Any]) -> None:
-        """Look once. Raises UnavailableError where no robot server answers; later it may go away and come back."""
+        """Look once. Raises UnavailableError if no robot server answers; later it may go away and come back."""
         self._server, self._arguments = server, dict(arguments)
         self._reader = StateReader(address)
         try:
@@ -37,7 +37,7 @@ class WatchPanel:
             self._reader.close()
             raise UnavailableError(str(error)) from error
         self.trouble = ""
-        """What is wrong, or nothing."""
+        """Current trouble, or empty."""
         self._is_closed = threading.Event()
         self._states: deque[RobotState] = deque([state], maxlen=WINDOW)
         gui = server.gui
@@ -51,7 +51,7 @@ class WatchPanel:
 
     @property
     def scene(self) -> Scene:
-        """Where everything was at the last look."""
+        """Positions at the last look."""
         return self._scenes[1]
 
     def draw(self) -> None:

@@ -41,7 +41,8 @@ def cockpit(
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page, on 127.0.0.1.")] = PORT,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the first episode.")] = None,
     api_key: Annotated[
-        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="API key. Prefer the variable: other users can see arguments.")
+        str | None,
+        typer.Option(envvar="RLSERVO_API_KEY", help="API key. Prefer the variable: other users can see arguments."),
     ] = None,
 ) -> None:
     """Show in the browser how a policy drives a robot.

@@ -13,13 +13,16 @@ from rlservo.export.contract.extras import needs_extra
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the bundles and the picture; an existing one is replaced.")] = Path("demo"),
+    out: Annotated[
+        Path, typer.Option(help="Folder for the bundles and the picture; an existing one is replaced.")
+    ] = Path("demo"),
     episodes: Annotated[int, typer.Option(min=1, help="Episodes per robot.")] = 20,
     checkpoints: Annotated[Path, typer.Option(help="Folder of the shipped checkpoints.")] = Path(
         "examples/checkpoints"
     ),
     cockpit: Annotated[
-        bool, typer.Option("--cockpit", help="Open a page to drive both robots, until Ctrl-C, instead of running episodes.")
+        bool,
+        typer.Option("--cockpit", help="Open a page to drive both robots, until Ctrl-C, instead of running episodes."),
     ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of that page, on 127.0.0.1.")] = 8090,
 ) -> None:

@@ -33,13 +33,12 @@ def export(
         str | None, typer.Option(help="Agent to export for, if agents that share a module are filtered differently.")
     ] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
-    value: Annotated[
-        bool, typer.Option("--value/--no-value", help="Include the value head.")
-    ] = True,
+    value: Annotated[bool, typer.Option("--value/--no-value", help="Include the value head.")] = True,
     untrained_filter: Annotated[
         bool,
         typer.Option(
-            "--untrained-filter", help="Export even if the observation filter's statistics are empty or come from evaluation."
+            "--untrained-filter",
+            help="Export even if the observation filter's statistics are empty or come from evaluation.",
         ),
     ] = False,
     source: Annotated[

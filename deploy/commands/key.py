@@ -11,9 +11,12 @@ from rlservo.deploy.terminal import Json, note, print_json
 
 def key(
     label: Annotated[str, typer.Argument(help="Label of the key, such as a robot or a person; shown in logs.")],
-    admin: Annotated[bool, typer.Option("--admin", help="Make a key for administration; robots do not need one.")] = False,
+    admin: Annotated[
+        bool, typer.Option("--admin", help="Make a key for administration; robots do not need one.")
+    ] = False,
     rate: Annotated[
-        float | None, typer.Option(help="Requests per second that each process accepts from this key; unlimited by default.")
+        float | None,
+        typer.Option(help="Requests per second that each process accepts from this key; unlimited by default."),
     ] = None,
     burst: Annotated[
         int | None, typer.Option(help="Requests accepted at once after a pause; one second's worth by default.")

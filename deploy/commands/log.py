@@ -26,7 +26,7 @@ PolicyName = Annotated[
 
 
 class Format(str, Enum):
-    """What a recording is converted to."""
+    """Target formats of a recording."""
 
     parquet = "parquet"
     lerobot = "lerobot"
@@ -103,7 +103,9 @@ def repair(
 @log.command()
 def plot(
     files: Files,
-    episode: Annotated[int, typer.Option(min=0, help="Number of the episode, from 0, in the order in which they ended.")] = 0,
+    episode: Annotated[
+        int, typer.Option(min=0, help="Number of the episode, from 0, in the order in which they ended.")
+    ] = 0,
     out: Annotated[Path, typer.Option(help="File for the picture: .png, .svg or .pdf.")] = Path("episode.png"),
 ) -> None:
     """Draw one recorded episode.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rlservo.serve_app.server.offline_commands import OfflineCommands
 
 policy = typer.Typer(
-    help="Change what is served: versions, aliases, rollback, canary, shadow. On a server, or in a repository.",
+    help="Change which versions are served. Aliases, rollback, canary and shadow, on a server or in a repository.",
     no_args_is_help=True,
 )
 
@@ -102,7 +102,7 @@ def unload(
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Unload a version that no alias, canary or shadow uses, or a whole policy.
+    """Unload an unused version, or a whole policy. No alias, canary or shadow may lead to the version.
 
     Example: `rlservo policy unload ur5 3`
     """
@@ -112,7 +112,9 @@ def unload(
 @policy.command()
 def alias(
     name: Name,
-    pair: Annotated[str, typer.Argument(metavar="ALIAS=VERSION", help="Alias and version; ALIAS= removes it, except production.")],
+    pair: Annotated[
+        str, typer.Argument(metavar="ALIAS=VERSION", help="Alias and version; ALIAS= removes it, except production.")
+    ],
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
@@ -145,13 +147,15 @@ def rollback(
 @policy.command()
 def canary(
     name: Name,
-    pair: Annotated[str, typer.Argument(metavar="VERSION=SHARE|off", help="Version or alias, and its share, 0 < share <= 1.")],
+    pair: Annotated[
+        str, typer.Argument(metavar="VERSION=SHARE|off", help="Version or alias, and its share, 0 < share <= 1.")
+    ],
     url: Url = LOCAL,
     key_file: KeyFile = None,
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Send a share of the sessions to another version, or end the canary.
+    """Give another version a share of the sessions. `off` ends the canary.
 
     Example: `rlservo policy canary ur5 candidate=0.1`
     """
@@ -168,7 +172,7 @@ def shadow(
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Compute another version's actions only to compare them, or end the shadow. Metrics have the differences.
+    """Compute and compare another version's actions. `off` ends the shadow. Metrics have the differences.
 
     Example: `rlservo policy shadow ur5 candidate`
     """

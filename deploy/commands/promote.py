@@ -26,7 +26,9 @@ def promote(
     name: Name,
     version: Annotated[str, typer.Argument(help="A loaded version that is not in production.")],
     canary: Annotated[str, typer.Option(metavar="SHARE", help="Share of the sessions: 10%, or 0.1.")] = "10%",
-    seconds: Annotated[str, typer.Option("--for", metavar="TIME", help="How long to watch the canary: 90s, 10m, 2h.")] = "10m",
+    seconds: Annotated[
+        str, typer.Option("--for", metavar="TIME", help="How long to watch the canary: 90s, 10m, 2h.")
+    ] = "10m",
     max_error_rate: Annotated[
         str | None, typer.Option(metavar="SHARE", help="Share of its requests that may fail by its own fault: 0.1%.")
     ] = None,
@@ -34,18 +36,26 @@ def promote(
         str | None, typer.Option(metavar="TIME", help="Latency in the server that 1% of its answers may exceed: 20ms.")
     ] = None,
     max_action_difference: Annotated[
-        float | None, typer.Option(min=0, help="Difference from production, in action units, that 1% of its actions may exceed.")
+        float | None,
+        typer.Option(min=0, help="Difference from production, in action units, that 1% of its actions may exceed."),
     ] = None,
     max_success_drop: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Allowed drop in the share of successful episodes below production's: 2%.")
+        str | None,
+        typer.Option(metavar="SHARE", help="Allowed drop in the share of successful episodes below production's: 2%."),
     ] = None,
-    min_requests: Annotated[int, typer.Option(min=1, help="Requests (or compared actions) required for a decision.")] = 100,
+    min_requests: Annotated[
+        int, typer.Option(min=1, help="Requests (or compared actions) required for a decision.")
+    ] = 100,
     min_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each version required for a decision.")] = 20,
-    log: Annotated[Path | None, typer.Option(help="File for the log in JSON lines; promote-NAME-VERSION.jsonl by default.")] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="File for the log in JSON lines; promote-NAME-VERSION.jsonl by default.")
+    ] = None,
     every: Annotated[float, typer.Option(min=0.2, max=10, help="Seconds between checks.")] = 5.0,
     url: Annotated[
         list[str],
-        typer.Option(help="URL of the server; repeat it to read the metrics of several replicas.", envvar="RLSERVO_URL"),
+        typer.Option(
+            help="URL of the server; repeat it to read the metrics of several replicas.", envvar="RLSERVO_URL"
+        ),
     ] = [LOCAL],  # noqa: B006 - typer copies it
     key_file: KeyFile = None,
     as_json: Json = False,
@@ -53,10 +63,10 @@ def promote(
     """Watch a canary, then promote it or roll it back.
 
     A share of the sessions gets the version, and the servers' metrics decide: it is rolled back at once when a limit is
-    surely exceeded, when metrics fall or contradict themselves, and when no one can tell for a minute; and when the
+    surely exceeded, when metrics fall or contradict themselves, and when they cannot be read for a minute; and when the
     time is over and a limit is exceeded or there is too little to judge. Exit code: 0 promoted, 1 rolled back, 4
-    stopped because somebody else has changed what is served or the server is out of reach, 2 bad input. Ctrl-C rolls
-    back (130). Killed, it leaves the canary running; the same line, started again, goes on with the time that is left.
+    stopped because another command changed what is served or the server is unreachable, 2 bad input. Ctrl-C rolls
+    back (130). Killed, it leaves the canary running; the same command continues with the time that is left.
 
     Example: `rlservo policy promote ur5 2 --canary 10% --for 10m --max-error-rate 0.1% --max-p99 20ms`
     """
@@ -81,7 +91,7 @@ def promote(
     )
     if limits == Limits(min_requests=min_requests, min_episodes=min_episodes):
         raise UsageError(
-            "nothing limits it: give --max-error-rate, --max-p99, --max-action-difference or --max-success-drop"
+            "no limit was given: give --max-error-rate, --max-p99, --max-action-difference or --max-success-drop"
         )
     share = _number("--canary", canary, {**PERCENT, "": 1.0}, 1.0)
     watched_s = _number("--for", seconds, SECONDS, LONGEST_S)
@@ -101,7 +111,7 @@ def promote(
         except RlservoError as error:  # nothing has begun, and 1 would say that it was rolled back
             raise UsageError(error.message) from None
         except (SystemExit, KeyboardInterrupt) as ended:
-            terminal.note(f"ended by a signal: what runs is left as it is; the same line goes on ({file})")
+            terminal.note(f"stopped by a signal: the canary keeps running; the same command continues ({file})")
             raise typer.Exit(ended.code if isinstance(ended, SystemExit) else 130) from None  # type: ignore[arg-type]
     if as_json:
         print_json({"outcome": outcome.outcome, "why": outcome.why, "finished": outcome.is_finished, "log": str(file)})

@@ -55,7 +55,9 @@ def replay(
 def estimate(
     files: Files,
     bundle: Bundle,
-    explore: Annotated[bool, typer.Option("--explore", help="Estimate the exploring policy instead of the deterministic one.")] = False,
+    explore: Annotated[
+        bool, typer.Option("--explore", help="Estimate the exploring policy instead of the deterministic one.")
+    ] = False,
     gamma: Annotated[float, typer.Option(help="Discount per step.")] = 1.0,
     policy: PolicyName = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the bootstrap.")] = 0,

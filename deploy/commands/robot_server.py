@@ -33,7 +33,9 @@ Clock = Annotated[
 ]
 RobotPort = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")]
 Gui = Annotated[bool, typer.Option("--gui", help="Show the robot in a window; needs a display.")]
-Seed = Annotated[int | None, typer.Option(help="Random seed of object paths and laser noise; differs every run by default.")]
+Seed = Annotated[
+    int | None, typer.Option(help="Random seed of object paths and laser noise; differs every run by default.")
+]
 
 
 Limit = Annotated[
@@ -54,11 +56,16 @@ def robot_server_ur(
         str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from where the arm is.")
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 25.0,
-    max_velocity_scale_factor: Annotated[float, typer.Option(help="Share of the joints' velocity limits that is used.")] = 1.0,
+    max_velocity_scale_factor: Annotated[
+        float, typer.Option(help="Share of the joints' velocity limits that is used.")
+    ] = 1.0,
     world: Annotated[str, typer.Option(help="empty, or a tabletop world of robo-gym.")] = "tabletop",
     model: Annotated[
         list[str] | None,
-        typer.Option("--object", help="Object model in the scene, such as sphere50; repeat it for more. Depends on --rs-mode by default."),
+        typer.Option(
+            "--object",
+            help="Object model in the scene, such as sphere50; repeat it for more. Depends on --rs-mode by default.",
+        ),
     ] = None,
     robot: Annotated[
         str, typer.Option(help="mujoco, or a real arm: rtde://192.168.0.2 (extra 'ur'; docs/how-to/ur-arm.md first).")

@@ -39,18 +39,22 @@ def rollout(
     transport: Annotated[
         TransportKind, typer.Option(help="http: JSON, a request per action; ws: one WebSocket.")
     ] = "http",
-    deadline_ms: Annotated[float | None, typer.Option(help="Deadline for each action; a later one is not used.")] = None,
+    deadline_ms: Annotated[
+        float | None, typer.Option(help="Deadline for each action; a later one is not used.")
+    ] = None,
     fallback: Annotated[
         str | None,
         typer.Option(
-            metavar="hold|zero|stop|ACTION", help="What the robot does if an action is late; by default the command fails."
+            metavar="hold|zero|stop|ACTION",
+            help="What the robot does if an action is late; by default the command fails.",
         ),
     ] = None,
     server_state: Annotated[
         bool, typer.Option("--server-state", help="Keep a recurrent policy's state on the server.")
     ] = False,
     api_key: Annotated[
-        str | None, typer.Option(envvar="RLSERVO_API_KEY", help="API key. Prefer the variable: other users can see arguments.")
+        str | None,
+        typer.Option(envvar="RLSERVO_API_KEY", help="API key. Prefer the variable: other users can see arguments."),
     ] = None,
     record: Annotated[
         Path | None, typer.Option(help="Record every decision, reward and ending into a new .mcap file or a folder.")

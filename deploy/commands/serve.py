@@ -56,7 +56,8 @@ def serve(
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 is any free one.")] = 8000,
     grpc_port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC on this port.")
+        int | None,
+        typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC on this port."),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
     default_policy: Annotated[

@@ -22,7 +22,7 @@ from rlservo.export.contract.extras import needs_extra
 if TYPE_CHECKING:
     from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable
 
-EPISODES = 100  # of each row, where the caller does not say
+EPISODES = 100  # of each row, if the caller does not say
 WIDTH = 140  # [characters], of the table at least: narrower its figures fall apart
 
 
@@ -37,9 +37,7 @@ def verify(
             "stuck (any or an element), payload [kg], model [share], base [m], target=outside, start=corner.",
         ),
     ] = None,
-    checkpoint: Annotated[
-        str | None, typer.Option(help="RLlib checkpoint to compare with; a folder or a URI.")
-    ] = None,
+    checkpoint: Annotated[str | None, typer.Option(help="RLlib checkpoint to compare with; a folder or a URI.")] = None,
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
     disturb: Annotated[
         bool, typer.Option("--disturb", help="Drive --env under disturbances: noise, latency, payload and others.")
@@ -69,8 +67,8 @@ def verify(
 ) -> None:
     """Prove a bundle against its checkpoint again. With --env it also drives episodes and adds them to the contract.
 
-    With --disturb it drives the simulator with latency, noise and more, and needs no checkpoint: success, return and endings
-    under each disturbance, over the same seeds.
+    With --disturb it drives the simulator with latency, noise and more, and needs no checkpoint: success,
+    return and endings under each disturbance, over the same seeds.
 
     Examples: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`,
     `rlservo verify policies/ur5 --env rlservo/EndEffectorPositioningURSim-v0 --disturb`,

@@ -235,7 +235,7 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
     with PolicyClient(url, ROBOTS[0].policy, timeout_s=2.0, retries=0) as probe:
         while True:
             if server.poll() is not None:
-                raise RlservoError(f"the server ended while starting: {_last_line(log)}")
+                raise RlservoError(f"the server exited while starting: {_last_line(log)}")
             try:
                 probe.wait_until_ready(timeout_s=1.0)
                 return

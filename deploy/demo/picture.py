@@ -34,7 +34,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class RobotRun:
-    """What the demo saw of one robot; `frames` is empty where the machine cannot draw."""
+    """Run of one robot in the demo; `frames` is empty if the machine cannot draw."""
 
     robot: Robot
     report: RolloutReport
@@ -45,7 +45,7 @@ class RobotRun:
 def film(policy: ActingPolicy, env_id: str, *, seed: int, steps: int, note: Callable[[str], object]) -> list[Frame]:
     """Return the first, middle and last picture of an episode that had so many steps with this seed.
 
-    None, with a note, where the machine cannot draw. Only these are drawn: a picture costs more than a step and its
+    None, with a note, if the machine cannot draw. Only these are drawn: a picture costs more than a step and its
     action together.
     """
     try:

@@ -175,7 +175,7 @@ class Mir100Navigation(RenderedEnv):
 
     @property
     def commanded_velocity(self) -> dict[str, Vector]:
-        """What the robot is commanded now, by unit."""
+        """Current command to the robot, by unit."""
         linear, angular = self.simulation.commanded_velocity
         return {"m/s": np.array([linear]), "rad/s": np.array([angular])}
 
@@ -208,7 +208,7 @@ class Mir100Navigation(RenderedEnv):
         self.simulation.move_cube(index, (x, y, yaws.get(index, 0.0)))
 
     def beams(self) -> Vector:
-        """Return both ends of every laser beam on the map [m] (n, 2, 3); none where there is nothing to see."""
+        """Return both ends of every laser beam on the map [m] (n, 2, 3); none if there is nothing to see."""
         return self.simulation.beams(self._shown_readings)
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
@@ -267,7 +267,7 @@ class Mir100Navigation(RenderedEnv):
         return self._polar(target_x, target_y)
 
     def _told_target_polar(self) -> tuple[float, float]:
-        """Return the same as the policy is told: where the robot believes to be, the target is elsewhere."""
+        """Return the observation as the policy gets it, from where the robot believes to be."""
         (target_x, target_y, _), (dx, dy) = self.simulation.target, self._base_offset
         return self._polar(target_x + dx, target_y + dy)
 

@@ -51,7 +51,7 @@ class Scanner:
 
     @property
     def count(self) -> int:
-        """How many beams are left."""
+        """Number of beams are left."""
         return self.BEAMS - self.dropped_first - self.dropped_last
 
     @property

@@ -111,13 +111,13 @@ class Mir100Simulation:
         return self.in_collision
 
     def move_target(self, pose: ArrayLike) -> None:
-        """Put the target somewhere else while the robot goes on. Raises ValueError for what is no pose."""
+        """Move the target while the robot continues. Raises ValueError for an invalid pose."""
         self._target = _pose("target", pose)
         _place_mocap(self.data, self._target_mocap, self._target)
         mujoco.mj_kinematics(self.model, self.data)
 
     def move_cube(self, index: int, pose: ArrayLike) -> None:
-        """Put a cube somewhere else while the robot goes on. Raises ValueError for what is no pose, or no cube."""
+        """Move a cube while the robot continues. Raises ValueError for an invalid pose or cube."""
         if not 0 <= index < len(self._cubes):
             raise ValueError(f"cube {index} does not exist: world {self.world.name!r} has {len(self._cubes)}")
         self._cubes[index] = _pose(f"cube {index}", pose)
@@ -176,7 +176,7 @@ class Mir100Simulation:
         return is_accepted
 
     def advance(self) -> None:
-        """Let one control cycle of 0.1 s pass. `in_collision` tells of a contact at any moment of it."""
+        """Let one control cycle of 0.1 s pass. `in_collision` reports a contact at any moment of it."""
         model, data, step = self.model, self.data, mujoco.mj_step
         ctrl = data.ctrl
         linear, angular = self._setpoint
@@ -206,7 +206,7 @@ class Mir100Simulation:
 
     @property
     def commanded_velocity(self) -> tuple[float, float]:
-        """What the robot is asked for now [m/s], [rad/s]."""
+        """Current command to the robot [m/s], [rad/s]."""
         return self._command
 
     @property
@@ -224,12 +224,12 @@ class Mir100Simulation:
 
     @property
     def target(self) -> Pose:
-        """Where the target is."""
+        """Pose of the target."""
         return self._target
 
     @property
     def cubes(self) -> list[Pose]:
-        """Where the cubes are."""
+        """Poses of the cubes."""
         return list(self._cubes)
 
     @property
@@ -244,7 +244,7 @@ class Mir100Simulation:
     def beams(self, readings: ArrayLike | None = None) -> Vector:
         """Return both ends of the laser beams in the map frame [m] (n, 2, 3), as the scan has them.
 
-        Of `readings` (n,) of beams picked evenly from all, as an observation has them, where given. None where the
+        Of `readings` (n,) of beams picked evenly from all, as an observation has them, where given. None if the
         world has nothing that a beam could meet.
         """
         if readings is not None:
@@ -261,7 +261,7 @@ class Mir100Simulation:
         """Return the robot server's `state`, (1030,).
 
         Target pose (3), robot pose (3), linear and angular velocity (2), front scan (501), back scan (511),
-        collision (1), cube poses (9; zeros where there are no cubes).
+        collision (1), cube poses (9; zeros if there are no cubes).
         """
         state = np.zeros(8 + BEAM_COUNT + 1 + 9)
         state[0:3] = self._target

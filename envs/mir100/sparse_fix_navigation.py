@@ -14,7 +14,7 @@ FIX_INTERVAL = 20  # control cycles: one fix in 2 s
 
 
 class SparseFixNavigationMir100Sim(NoObstacleNavigationMir100Sim):
-    """Drive a MiR100 to within 0.2 m of a target whose place it is told once in two seconds.
+    """Drive a MiR100 to within 0.2 m of a target whose place it gets once in two seconds.
 
     The task is `rlservo/NoObstacleNavigationMir100Sim-v0`, as a robot has it whose localisation is slow: the
     odometry speaks every cycle, a beacon or marker gives a fix every `fix_interval` cycles. In
@@ -35,7 +35,7 @@ class SparseFixNavigationMir100Sim(NoObstacleNavigationMir100Sim):
     ## Action, reward, endings, reset options
 
     Those of `NoObstacleNavigationMir100Sim`: velocities up to 0.5 m/s and 0.7 rad/s at 10 Hz; 50 per metre gained (also
-    where the policy does not see it), +200 on success, -200 out of the boundary; 500 steps at most.
+    if the policy does not see it), +200 on success, -200 out of the boundary; 500 steps at most.
 
     ## Constructor
 

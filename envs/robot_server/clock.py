@@ -1,7 +1,7 @@
 """Clock of a robot server: a cycle ends at once (`fast`), or when its time on the wall is over (`real`).
 
 Either way the same calls give the same trajectory. In real time a client that does not keep pace is waited for, up to
-half a second; beyond that time goes on without it, as it does on the robot.
+half a second; beyond that time continues without it, as it does on the robot.
 """
 
 from __future__ import annotations

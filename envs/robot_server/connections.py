@@ -1,4 +1,4 @@
-"""Count the clients connected to one of our ports, as the kernel sees them. gRPC does not tell."""
+"""Count the clients connected to one of our ports, as the kernel sees them. gRPC does not report it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ ESTABLISHED = "01"
 
 
 def count_connections(port: int) -> int | None:
-    """Return the number of established TCP connections to local port `port`; None where there is no /proc to ask."""
+    """Return the number of established TCP connections to local port `port`; None if there is no /proc to ask."""
     count, has_table = 0, False
     suffix = f"{port:04X}"
     for table in (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6")):

@@ -41,7 +41,7 @@ def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host
 
     Raises ValueError naming the package, launch file, argument or value that is not known or not simulated.
     """
-    if len(line) > MAX_LINE:  # before any work on it: whoever reaches the manager's port can send a line
+    if len(line) > MAX_LINE:  # before any work on it: anyone who reaches the manager's port can send a line
         raise ValueError(f"the line has {len(line):,} characters: expected at most {MAX_LINE:,}")
     try:
         words = shlex.split(line)
@@ -59,7 +59,7 @@ def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host
     for word in words[3:]:
         name, separator, value = word.partition(":=")
         if not separator or not _NAME.fullmatch(name):
-            raise ValueError(f"{word[:200]!r} is no launch argument: expected name:=value")
+            raise ValueError(f"{word[:200]!r} is not a launch argument: expected name:=value")
         if len(value) > MAX_VALUE or not value.isprintable():  # it may stand in the log, on a line of its own
             raise ValueError(f"{name} is {value[:200]!r}: expected at most {MAX_VALUE:,} printable characters")
         arguments[name] = value
@@ -140,7 +140,7 @@ def _check_names(arguments: Mapping[str, str], known: set[str], only: Mapping[st
 def _port(arguments: Mapping[str, str]) -> int:
     text = arguments.get("server_port", "0")
     if not _PORT.fullmatch(text):
-        raise ValueError(f"server_port:={text} is no port: expected a whole number, 0 (any free one) to 65535")
+        raise ValueError(f"server_port:={text} is not a port: expected a whole number, 0 (any free one) to 65535")
     return int(text)
 
 
@@ -151,4 +151,4 @@ def _number(arguments: Mapping[str, str], name: str, default: float) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"{name}:={text} is no number") from None
+        raise ValueError(f"{name}:={text} is not a number") from None

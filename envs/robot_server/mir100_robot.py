@@ -32,7 +32,7 @@ class Mir100Robot:
 
     @property
     def cycle_s(self) -> float:
-        """How long a control cycle lasts [s]."""
+        """Duration of a control cycle [s]."""
         return CYCLE_S
 
     def close(self) -> None:
@@ -44,7 +44,7 @@ class Mir100Robot:
         return RobotState(values=self.simulation.state().tolist())
 
     def set_state(self, target: RobotState) -> int:
-        """Put target and robot at rest, and cubes where there are any and they are given; it counts as two cycles."""
+        """Put target and robot at rest, and cubes if there are any and they are given; it counts as two cycles."""
         values = target.values
         if not (len(values) == STATE_LENGTH or ROBOT.stop <= len(values) <= CUBES.start):
             raise ValueError(
@@ -56,7 +56,7 @@ class Mir100Robot:
             flat = list(values[CUBES])
             cubes = [flat[start : start + 3] for start in range(0, len(flat), 3)]
         self.simulation.place(list(values[ROBOT]), target=list(values[TARGET]), cubes=cubes)
-        # Not simulated: a robot at rest stays, and one that was put into a wall is told to be there, in collision.
+        # Not simulated: a robot at rest stays, and one that was put into a wall is reported there, in collision.
         return SETTLE_CYCLES
 
     def act(self, action: Sequence[float]) -> None:

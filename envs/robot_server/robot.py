@@ -30,7 +30,7 @@ class Robot(Protocol):
 
     @property
     def cycle_s(self) -> float:
-        """How long a control cycle lasts [s]."""
+        """Duration of a control cycle [s]."""
         ...
 
     def state(self) -> RobotState:

@@ -1,4 +1,4 @@
-"""Runs one robot server: makes the robot, binds a port, serves until told to stop.
+"""Runs one robot server: makes the robot, binds a port, serves until it is stopped.
 
 `rlservo robot-server` runs it in the foreground. The server manager runs it as a process of its own
 (`python -m rlservo.envs.robot_server.server '<settings>'`), which says on standard output what port it has, and ends
@@ -87,7 +87,7 @@ def bind(server: grpc.Server, host: str, port: int) -> int:
         _probe(host, port, address)  # what was missing may be missing still: a file descriptor, say
         if port:
             raise PortInUseError(f"cannot listen on {address}: the port is taken") from error
-        raise CannotListenError(f"cannot listen on {address}: gRPC could not, and did not say why") from error
+        raise CannotListenError(f"cannot listen on {address}: gRPC failed without a reason") from error
 
 
 def _probe(host: str, port: int, address: str) -> None:
@@ -112,8 +112,8 @@ def _probe(host: str, port: int, address: str) -> None:
 def stop_signals() -> queue.SimpleQueue[int]:
     """Return where SIGTERM and SIGINT arrive from now on. Main thread only.
 
-    Not an Event: `set` in a handler waits for ever when the signal interrupts its own thread inside `wait`, at a moment
-    in which that holds the lock. A SimpleQueue's `put` may interrupt its `get`.
+    Not an Event: `set` in a handler waits indefinitely when the signal interrupts its own thread inside `wait`,
+    which holds the lock. A SimpleQueue's `put` may interrupt its `get`.
     """
     arrived: queue.SimpleQueue[int] = queue.SimpleQueue()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -122,7 +122,7 @@ def stop_signals() -> queue.SimpleQueue[int]:
 
 
 def arrives(signals: queue.SimpleQueue[int], timeout_s: float | None = None) -> bool:
-    """Wait for a signal, for ever without a time; return whether one has come.
+    """Wait for a signal, indefinitely without a time; return whether one has come.
 
     A wait without an end is one of many seconds: what comes a moment before it begins, or to another thread, interrupts
     nothing, and its handler would not run until something did.
@@ -137,9 +137,9 @@ def arrives(signals: queue.SimpleQueue[int], timeout_s: float | None = None) -> 
 
 
 def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s: float | None = None) -> None:
-    """Serve until SIGTERM or SIGINT, or until nobody has been connected for `orphan_s` seconds. Main thread only.
+    """Serve until SIGTERM or SIGINT, or until no client has been connected for `orphan_s` seconds. Main thread only.
 
-    A server that nobody has called yet waits no longer than one that was left: robo-gym's environments connect at their
+    A server that was never called waits no longer than one whose client left: robo-gym's environments connect at their
     first `reset`, and one that is made and never reset must not keep a simulator.
     """
     signals = stop_signals()
@@ -152,7 +152,7 @@ def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s
                 alone_since = time.monotonic()
                 continue
             if orphan_s is not None and time.monotonic() - alone_since > orphan_s:
-                log.warning("nobody has been connected for %g s: this server ends itself", orphan_s)
+                log.warning("no client for %g s: this server shuts down", orphan_s)
                 return
     finally:
         server.stop()

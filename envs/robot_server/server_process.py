@@ -82,11 +82,11 @@ class ServerProcess:
                     raise StartFailedError(f"the robot server did not come up within {START_TIMEOUT_S:g} s")
                 part = os.read(pipe, 4096)
                 if not part:
-                    raise StartFailedError(f"the robot server ended while starting (exit code {self._process.wait()})")
+                    raise StartFailedError(f"the robot server exited while starting (exit code {self._process.wait()})")
                 output += part
         line = output.decode(errors="replace").splitlines()[0]
         if line.startswith(FAILED):
             raise StartFailedError(line.removeprefix(FAILED))
         if not line.startswith(READY):
-            raise StartFailedError(f"the robot server said {line!r} instead of {READY!r}")
+            raise StartFailedError(f"the robot server printed {line!r} instead of {READY!r}")
         return int(line.removeprefix(READY))

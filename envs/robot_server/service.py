@@ -97,8 +97,8 @@ class RobotService:
             return
         try:
             self._robot.camera.show()
-        except Exception as error:  # whatever a display can do; the robot goes on without a window
-            log.warning("%s: the robot goes on without a window", error)
+        except Exception as error:  # whatever a display can do; the robot continues without a window
+            log.warning("%s: the robot continues without a window", error)
             self._gui = False
 
 

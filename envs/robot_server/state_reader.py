@@ -1,4 +1,4 @@
-"""Reads a robot server's state beside the client that drives it, and shows it on an environment's simulator."""
+"""Reads a robot server's state while a client drives it, and shows it on an environment's simulator."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OBJECT = [f"object_0_to_ref_translation_{axis}" for axis in "xyz"]
 
 
 class RobotServerError(ConnectionError):
-    """The robot server does not answer, or with what is no state."""
+    """The robot server does not answer, or not with a state."""
 
 
 class StateReader:
@@ -45,7 +45,7 @@ class StateReader:
         except grpc.RpcError as error:
             raise RobotServerError(f"no robot server answers at {self.address}: {error.code().name.lower()}") from error
         if not message.success:
-            raise RobotServerError(f"the robot server at {self.address} could not tell its state: see its log")
+            raise RobotServerError(f"the robot server at {self.address} could not report its state: see its log")
         return RobotState(values=list(message.state), names=dict(message.state_dict))
 
     def close(self) -> None:
@@ -79,7 +79,7 @@ def show_state(env: RenderedEnv, state: RobotState) -> None:
         env.simulation.place(values[ROBOT], target=values[TARGET], cubes=cubes)
         env.show_readings(values[SCAN] if cubes is not None else np.zeros(0))
     else:
-        raise RobotServerError("the robot server has another robot by now")
+        raise RobotServerError("the robot server now has another robot")
 
 
 def quantities(state: RobotState) -> dict[str, tuple[float, str]]:

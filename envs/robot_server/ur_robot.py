@@ -26,7 +26,7 @@ INITIAL_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad], until the first Set
 ROS_JOINTS = [JOINTS[index] for index in ROS_ORDER]
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 ROUNDING = 1e-5  # [rad], by which a float32 may exceed a limit
-# A list that is no state of ours has the positions after six other numbers, as in robo-gym's first versions.
+# A list that is not one of our states has the positions after six other numbers, as in robo-gym's first versions.
 OLD_LIST = (*range(6), *(f"{joint}_joint_position" for joint in ROS_JOINTS))
 
 
@@ -57,7 +57,7 @@ class URRobot:
 
     @property
     def cycle_s(self) -> float:
-        """How long a control cycle lasts [s]."""
+        """Duration of a control cycle [s]."""
         return cycle_of(self._settings.action_cycle_rate)
 
     def state(self) -> RobotState:

@@ -87,7 +87,7 @@ class URArmEnv(RenderedEnv):
         scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
         rate_hz = self.RATE_HZ if action_cycle_rate is None else action_cycle_rate
         if fixed.all():
-            raise ValueError("all six joints are fixed: there is nothing left to act on")
+            raise ValueError("all six joints are fixed: no joint is left to act on")
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._build = partial(
@@ -196,7 +196,7 @@ class URArmEnv(RenderedEnv):
 
     @property
     def commanded_velocity(self) -> dict[str, Vector]:
-        """What the joints are commanded now, by unit."""
+        """Current command to the joints, by unit."""
         return {"rad/s": self.simulation.commanded_velocity}
 
     # -- for viewers
@@ -243,7 +243,7 @@ class URArmEnv(RenderedEnv):
 
     @abstractmethod
     def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
-        """Return the reward of the step that ended with `observation`, and the final status where it ends the episode.
+        """Return the reward of the step that ended with `observation`, and the final status if it ends the episode.
 
         The time limit is not its concern.
         """

@@ -39,7 +39,7 @@ def build_model(
 ) -> mujoco.MjModel:
     """Return the compiled model: the arm standing on the table (or 0.1 m above bare ground) and the objects named.
 
-    Object i is the mocap body `object_<i>`; where there is no table a post that nothing collides with is drawn.
+    Object i is the mocap body `object_<i>`; if there is no table a post that nothing collides with is drawn.
 
     Joints are named as in `JOINTS`; `tool0` is a site at wrist_3's origin. Each joint has two actuators that together
     are one servo: `<joint>` integrates its control, a velocity [rad/s], into a position setpoint, `<joint>_velocity`
@@ -155,7 +155,7 @@ def _objects(objects: list[ObjectModel]) -> str:
         size = " ".join([str(model.half_size)] * (1 if model.shape == "sphere" else 3))
         # Seen by the links' contype, and by nothing else; the arm's base does not move and so never counts.
         touch = f'contype="0" conaffinity="1" {OBJECT_SOFTNESS}' if model.collides else 'class="seen"'
-        # Out of the way until somebody places it, where the original parks its objects.
+        # Out of the way until it is placed, where the original parks its objects.
         lines.append(f'<body name="object_{index}" mocap="true" pos="{index} 0 {PARKED_HEIGHT + BASE_HEIGHT}">')
         lines.append(f'<geom name="object_{index}" {touch} type="{model.shape}" size="{size}" rgba="{model.rgb} 1"/>')
         if model.halo:

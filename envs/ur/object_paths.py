@@ -153,7 +153,7 @@ def interpolate(points: NDArray[np.float64], count: int) -> Path:
     not-a-knot condition at both ends. Raises ValueError for fewer than four points and where two neighbours coincide.
     """
     if len(points) < 4:
-        raise ValueError(f"a spline was asked for through {len(points)} points: expected at least 4")
+        raise ValueError(f"the spline has {len(points)} points: expected at least 4")
     chords = np.linalg.norm(np.diff(points, axis=0), axis=1)
     if not (chords > 0.0).all():
         raise ValueError("two neighbouring points of a spline coincide: expected a box with some extent")

@@ -15,7 +15,7 @@ ROS_ORDER = (2, 1, 0, 3, 4, 5)
 
 @dataclass(frozen=True)
 class RsMode:
-    """What a mode tells besides joints, end effector and collision."""
+    """Content of a mode's state besides joints, end effector and collision."""
 
     objects: int
     forearm: bool

@@ -332,14 +332,14 @@ class URSimulation:
         return self._forearm_xmat.reshape(3, 3)  # type: ignore[no-any-return]
 
     def object_position(self, index: int) -> Vector:
-        """Where an object is, in base_link [m] (3,)."""
+        """Position of an object in base_link [m] (3,)."""
         position: Vector = self.data.mocap_pos[self._objects[index]].copy()
         position[2] -= BASE_HEIGHT
         return position
 
     @property
     def object_count(self) -> int:
-        """How many objects the scene holds."""
+        """Number of objects the scene holds."""
         return len(self._objects)
 
     def contacts(self) -> list[tuple[str, str]]:

@@ -45,7 +45,9 @@ def best_checkpoint(
         raise CheckpointError(f"{root} is not a folder: expected a Tune trial or experiment")
     trials = [root] if (root / RESULTS).is_file() else sorted(child.parent for child in root.glob(f"*/{RESULTS}"))
     if not trials:
-        raise CheckpointError(f"{root} is no Tune trial or experiment: looked for {RESULTS} in it and in its folders")
+        raise CheckpointError(
+            f"{root} is not a Tune trial or experiment: looked for {RESULTS} in it and in its folders"
+        )
     candidates: list[Candidate] = []
     reported: set[str] = set()
     with user_code(app_dir):

@@ -27,7 +27,7 @@ _ENV_STEPS = ((_STEPS,), ("env_runners", _STEPS), f"env_runners--{_STEPS}")
 
 @dataclass(frozen=True)
 class CheckpointFacts:
-    """Facts for the contract's provenance; None where the checkpoint does not tell."""
+    """Facts for the contract's provenance; None if the checkpoint does not have them."""
 
     algorithm: str = "unknown"
     env_id: str | None = None
@@ -98,7 +98,7 @@ def _open(file: Path, what: str, notify: Callable[[str], None]) -> dict[str, Any
     try:
         opened = unpickle(file, missing_ok=True)
     except CheckpointError as error:
-        notify(f"the checkpoint's {what} cannot be told: {error}")
+        notify(f"the checkpoint's {what} cannot be read: {error}")
         return None
     return opened if isinstance(opened, dict) else None
 

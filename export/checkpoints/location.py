@@ -1,6 +1,6 @@
 """Find the files of a checkpoint: from whatever folder a person points at to the folders the exporter reads.
 
-Names of files are enough for it, so that a wrong path is told before RLlib is imported or code in a checkpoint runs.
+File names are enough for it, so that a wrong path is reported before RLlib is imported or code in a checkpoint runs.
 """
 
 from __future__ import annotations
@@ -52,11 +52,11 @@ class CheckpointFiles:
     alone: bool = False
     part: bool = False  # of a MultiRLModule that was saved by itself
     agent_id: str | None = None
-    """The agent that was asked for, where the module serves several."""
+    """The agent that was asked for, if the module serves several."""
 
     @property
     def is_one_of_several(self) -> bool:
-        """Whether the policy goes by an id of its own, and may have others beside it."""
+        """Whether the policy goes by an id of its own, and may have others next to it."""
         return self.module_id != DEFAULT_POLICY and (self.part or not self.alone)
 
     @property
@@ -125,7 +125,7 @@ class CheckpointFiles:
 
 
 Files: TypeAlias = CheckpointFiles | OldStackFiles
-"""Where one policy is, on either API stack."""
+"""Location of one policy, on either API stack."""
 
 
 def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: str | None = None) -> Files:

@@ -41,7 +41,7 @@ class OldStackFiles:
 
     @property
     def is_one_of_several(self) -> bool:
-        """Whether the policy goes by an id of its own, and may have others beside it."""
+        """Whether the policy goes by an id of its own, and may have others next to it."""
         return self.policy != self.root and self.module_id != DEFAULT_POLICY
 
     @property

@@ -13,7 +13,7 @@ from typing import Any
 from rlservo.export.contract.errors import UnsupportedError
 
 OLD_WEIGHTS = "module_state.pt"
-"""The weights' file up to Ray 2.40. It is a pickle, too."""
+"""The weights' file up to Ray 2.40. It is also a pickle."""
 _ALGORITHMS = "ray.rllib.algorithms"
 MOVED = {
     ("ray.rllib.core.learner.learner", "TorchCompileWhatToCompile"): (
@@ -30,7 +30,7 @@ MOVED = {
         for name in ("APPO", "BC", "CQL", "PPO", "SAC")
     },
 }  # fmt: skip
-"""Where names of older Rays are now (ray 2.60)."""
+"""New places of names of older Rays (ray 2.60)."""
 
 
 class Gone:

@@ -1,6 +1,6 @@
 """Load a checkpoint's pickles, and explain in one sentence why one cannot be loaded.
 
-Loading a pickle runs the code it names; callers say so first.
+Loading a pickle runs the code it names; callers warn first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TRUNCATED = "the file is truncated or damaged ({})"
 def user_code(app_dir: str | Path) -> Iterator[Path]:
     """Let the checkpoint import the user's own modules from `app_dir`, before anything else of that name.
 
-    Gives the folder's absolute path. Raises UsageError where it is not a folder.
+    Gives the folder's absolute path. Raises UsageError if it is not a folder.
     """
     folder = str(Path(app_dir).expanduser().absolute())
     if not Path(folder).is_dir():

@@ -26,7 +26,7 @@ def transform_of(contract: Contract) -> Transform:
 
 
 def is_invertible(contract: Contract) -> bool:
-    """Return whether own actions can be told from sent ones: not where something else changes them, too."""
+    """Return whether own actions can be recovered from sent ones: not if something else also changes them."""
     steps = [step.step for step in contract.baked_in]
     after = steps[steps.index("mode") :] if "mode" in steps else []
     return not {"user_connector", "scale"} & set(after)

@@ -42,22 +42,22 @@ CONTRACT_FILE = "contract.json"
 GOLDEN_FILE = "golden.npz"
 SUMS_FILE = "SHA256SUMS"
 CONTRACT_KEY = "rlservo.contract"
-"""Where the graph's own metadata repeat the contract."""
+"""Key of the contract in the graph's own metadata."""
 MAX_SUMS_BYTES = 1 << 16
 MAX_FILES = 16  # the four, and what a user may have added
 DESCRIPTORS = Path("/proc/self/fd")  # Linux: a file that this process has open, whether it has a name or not
 BAD_ARCHIVE = (OSError, ValueError, EOFError, RuntimeError, KeyError, MemoryError, zlib.error, zipfile.BadZipFile)
-"""What zipfile and numpy raise on archives that are none."""
+"""Exceptions of zipfile and numpy for broken archives."""
 DictSpec.model_rebuild()
 TupleSpec.model_rebuild()
 
 
 @dataclass(frozen=True)
 class BundleLimits:
-    """How large a bundle's files may be; larger ones are refused before they are read. A server sets its own."""
+    """Size limits of a bundle's files; larger ones are refused before they are read. A server sets its own."""
 
     max_policy_bytes: int | None = None
-    """Of each file but the two below; None is no limit."""
+    """Limit of each file except the two below; None for no limit."""
 
     max_golden_bytes: int = 512 << 20
     """Of golden.npz, packed and unpacked."""
@@ -85,7 +85,7 @@ class Bundle:
     sums: Mapping[str, str]
     """The SHA-256 of each file, as recorded."""
     digest: str
-    """What tells this bundle from every other: the hash of its hashes."""
+    """Identity of this bundle: the hash of its hashes."""
     limits: BundleLimits = DEFAULT_LIMITS
 
     @property
@@ -99,7 +99,7 @@ class Bundle:
     def golden(self) -> tuple[dict[str, NDArray[Any]], dict[str, NDArray[Any]]]:
         """Return the golden (inputs, outputs) by tensor name; all share the leading batch axis.
 
-        Raises BundleError, and BundleTamperedError where the file is no longer the one that was checked.
+        Raises BundleError, and BundleTamperedError if the file is no longer the one that was checked.
         """
         inputs: dict[str, NDArray[Any]] = {}
         outputs: dict[str, NDArray[Any]] = {}
@@ -117,7 +117,7 @@ class Bundle:
 
     @contextmanager
     def verified_copy(self, name: str) -> Iterator[Path]:
-        """Give the path of a copy of a file which nobody else can change: the very bytes whose hash was compared.
+        """Give the path of a private copy of a file: the very bytes whose hash was compared.
 
         On Linux it is in no folder and gone with this process. Raises BundleError, BundleTamperedError.
         """
@@ -218,7 +218,7 @@ def _parse_contract(file: Path, content: bytes) -> Contract:
 
 
 def digest_of(folder: Path) -> str:
-    """Return what tells a bundle from every other: the hash of its hashes. Raises BundleError."""
+    """Return the identity of a bundle: the hash of its hashes. Raises BundleError."""
     return read_sums(folder)[0]
 
 
@@ -280,7 +280,7 @@ def _check_unpacked(file: Path, content: io.BytesIO, max_bytes: int) -> None:
                 read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
                 shape, _, dtype = read(stream)
             if math.prod(shape) * dtype.itemsize > member.file_size:
-                raise BundleError(f"{file}: '{member.filename}' says that it is of shape {shape} and holds less")
+                raise BundleError(f"{file}: '{member.filename}' declares the shape {shape} and holds less")
     content.seek(0)
 
 
@@ -306,7 +306,7 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
 def write_contract(folder: Path, contract: Contract) -> None:
     """Write contract.json and, with it, SHA256SUMS over all four files, of which the other three must exist.
 
-    Both are written beside the old ones and then take their names: whatever fails before leaves the bundle as it was.
+    Both are written next to the old ones and then take their names: whatever fails before leaves the bundle as it was.
     """
     with tempfile.TemporaryDirectory(prefix=".contract-", dir=folder) as name:
         beside = Path(name)

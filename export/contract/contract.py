@@ -17,7 +17,7 @@ REWARD = "reward"  # the graph's input for what the last action brought, of a po
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
 Tolerance: TypeAlias = Annotated[float, Field(ge=0.0, le=1e-2)]
-"""Beyond it a difference is no rounding, whatever a contract says."""
+"""A larger difference is not rounding, whatever a contract says."""
 
 
 class TensorSpec(FrozenModel):
@@ -44,8 +44,8 @@ class StateSpec(FrozenModel):
     initial: float | tuple[float, ...] = Field(0.0, description="One number, or one per element in row-major order")
     kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = Field(
         "recurrent",
-        description="'previous_actions' holds the last actions' one-hot codes, oldest first: whoever acts otherwise "
-        "than the graph's own `action` (exploring) writes that action's code into the end of it",
+        description="'previous_actions' holds the last actions' one-hot codes, oldest first: a caller that acts "
+        "otherwise than the graph's own `action` (exploring) writes that action's code into the end of it",
     )
 
     def initial_value(self, batch: int) -> NDArray[Any]:
@@ -56,7 +56,7 @@ class StateSpec(FrozenModel):
 
 
 class Distribution(FrozenModel):
-    """How `action_dist_inputs` become an exploring action; the deterministic one is the graph's own `action`."""
+    """Rule from `action_dist_inputs` to an exploring action; the deterministic one is the graph's own `action`."""
 
     kind: Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"] = Field(
         description="'multi' has one part for each leaf of a nested action space, in the order of the graph's outputs: "
@@ -78,7 +78,7 @@ class BakedStep(FrozenModel):
 
 
 class Provenance(FrozenModel):
-    """Where the policy came from."""
+    """Origin of the policy."""
 
     algorithm: str
     source: str = Field("rllib", description="Which source read it: 'rllib', 'sb3', ...")
@@ -106,7 +106,7 @@ class FormatParity(FrozenModel):
 
 
 class Parity(FrozenModel):
-    """How the export was proven equal to what the framework itself would send to env.step."""
+    """Proof that the export equals what the framework itself would send to env.step."""
 
     reference: str
     samples: int = Field(ge=0)
@@ -118,7 +118,7 @@ class Parity(FrozenModel):
 
 
 class Evaluation(FrozenModel):
-    """One closed-loop run of the exported policy: beside its checkpoint on the same seeds, or under a disturbance."""
+    """One closed-loop run of the exported policy: with its checkpoint on the same seeds, or under a disturbance."""
 
     env_id: str
     episodes: Size

@@ -184,7 +184,7 @@ class UnavailableError(RlservoError):
     """The server is not ready, over capacity, or out of reach."""
 
     code = "unavailable"
-    retry_after_s: float | None = None  # [s] after which the server wants to be asked again, where it said so
+    retry_after_s: float | None = None  # [s] after which to ask the server again, if it gave a time
 
 
 class OverloadedError(UnavailableError):
@@ -217,7 +217,7 @@ class ConflictError(RlservoError):
 
 
 class RefusedError(ConflictError):
-    """A version or a configuration cannot be served, so what ran before goes on."""
+    """A version or a configuration cannot be served, so what ran before continues."""
 
     code = "version-refused"
 

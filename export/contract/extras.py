@@ -30,7 +30,7 @@ def require(extra: str, *packages: str, what: str = "this command") -> None:
 
 @contextmanager
 def needs_extra(extra: str, *packages: str, what: str = "this command") -> Iterator[None]:
-    """Require an extra's packages, and raise UsageError, too, when an import inside fails."""
+    """Require an extra's packages; also raise UsageError when an import inside fails."""
     require(extra, *packages, what=what)
     try:
         yield
@@ -41,7 +41,7 @@ def needs_extra(extra: str, *packages: str, what: str = "this command") -> Itera
 
 
 def optional_package(name: str, purpose: str) -> ModuleType:
-    """Import a package that one purpose needs and no extra has; raise UsageError where it is missing."""
+    """Import a package that one purpose needs and no extra has; raise UsageError if it is missing."""
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

@@ -1,7 +1,7 @@
 """Nested actions: between the space's own form (dicts and tuples) and the tensors `action.<path>`.
 
 A Dict is a map with exactly its keys, a Tuple a list of exactly its length. A batch has a batch axis on every leaf, as
-Gymnasium's vector environments give it; for a Dict, a list of single observations is a batch, too.
+Gymnasium's vector environments give it; for a Dict, a list of single observations is also a batch.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def build_action(space: SpaceSpec, leaves: Mapping[str, Any], path: str = "actio
 def action_leaves(space: SpaceSpec, action: Any, path: str = "action") -> dict[str, Any]:
     """Return a nested action's leaves by tensor name: `build_action`, undone.
 
-    Raises RequestError where it is not of the space's form.
+    Raises RequestError if it is not of the space's form.
     """
     if isinstance(space, DictSpec):
         if not isinstance(action, Mapping) or set(action) != set(space.spaces):

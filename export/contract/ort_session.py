@@ -19,7 +19,7 @@ def open_ort_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSessi
     Raises onnxruntime's own exceptions, which share no base but Exception.
     """
     # onnxruntime 1.31's Linux wheels report use to Microsoft from the moment they are imported unless this is set
-    # (its Privacy.md). What exports or runs a robot's policy calls nobody; whoever wants it may set the variable to 0.
+    # (its Privacy.md). Code that exports or runs a policy must not call home; set the variable to 0 to allow it.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
 

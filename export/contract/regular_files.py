@@ -1,7 +1,7 @@
 """Bounded reading of regular files, and of nothing else.
 
 Whoever may write into a folder that a server reads may put a FIFO, a device or a file without end there: opening the
-first waits for ever, opening the second may do something, reading the third fills the memory.
+first blocks, opening the second may do something, reading the third fills the memory.
 """
 
 from __future__ import annotations

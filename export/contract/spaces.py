@@ -114,11 +114,11 @@ class MultiBinarySpec(FrozenModel):
 
 
 class _NestedSpec(FrozenModel):
-    """What the contract's Dict and Tuple share."""
+    """Common base of the contract's Dict and Tuple."""
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """A nested space is no array."""
+        """A nested space is not an array."""
         return ()
 
     @property

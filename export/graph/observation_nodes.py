@@ -192,7 +192,7 @@ class FilterNode(ObservationNode):
 
 
 class FrameStackNode(ObservationNode):
-    """The last frames side by side; the state holds all but the newest, those between, too."""
+    """The last frames side by side; the state holds all but the newest, including those between."""
 
     def __init__(self, step: FrameStack) -> None:
         super().__init__()
@@ -257,7 +257,7 @@ class SineAndCosineNode(ObservationNode):
 
 
 class PreviousNode(ObservationNode):
-    """The observation beside the last actions' codes and the last rewards; the graph itself keeps its action."""
+    """The observation with the last actions' codes and the last rewards; the graph itself keeps its action."""
 
     def __init__(self, step: Previous) -> None:
         super().__init__()

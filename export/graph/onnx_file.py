@@ -137,7 +137,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _silent_descriptors() -> Iterator[None]:
-    """Send standard output and error to nowhere: torch's C++ prints the whole graph where it cannot convert it."""
+    """Send standard output and error to nowhere: torch's C++ prints the whole graph if it cannot convert it."""
     sys.stdout.flush()
     sys.stderr.flush()
     saved = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]

@@ -5,7 +5,7 @@ large angles in `%`, and write double-precision `atan` for a kernel that onnxrun
 `exact_operators` is entered, torch's Python functions, methods and operators of these names compute what torch itself
 computes (ATen/native, torch 2.13) in steps that survive both exporters. TorchScript needs none of it: it runs torch.
 
-A rounding is promised where the operator itself rounds: `hypot`, `atan2` and the logarithms to a few units in the last
+A rounding is promised if the operator itself rounds: `hypot`, `atan2` and the logarithms to a few units in the last
 place, functions without a double-precision kernel to single precision. The rest is bit by bit.
 """
 
@@ -44,7 +44,7 @@ SYNONYMS = {"axis": "dim", "keepdims": "keepdim"}
 OPERANDS = (
     "sorted_sequence", "input", "x", "x1", "other", "x2", "y", "values", "boundaries", "indices", "tensor1", "tensor2",
 )  # fmt: skip
-"""What torch calls tensors given by keyword, in the order of its signatures."""
+"""Torch's keywords for tensors, in the order of its signatures."""
 
 
 def _is_real(args: tuple[Any, ...], *, integers: bool) -> bool:

@@ -26,7 +26,7 @@ INSTEAD = {
     r"nonzero\w*|masked_select|\w*unique\w*": "its result's shape depends on the numbers: use torch.where and a mask",
     r"rand\w*|normal\w*|bernoulli\w*|multinomial": "an exported policy does not draw numbers: leave the noise out",
 }
-"""What to write instead of operators that no exporter takes, by a pattern of ATen's names."""
+"""Replacements for operators that no exporter takes, by a pattern of ATen's names."""
 OTHERWISE = "compose it of arithmetic, comparisons, torch.where, torch.cat and sums along an axis"
 
 
@@ -55,7 +55,7 @@ def why_not_onnx(graph: torch.nn.Module, example: Inputs, errors: Sequence[Excep
     places = _operators(graph, example)
     refused = [name for error in errors for name in _refused_operators(error)]
     if refused:
-        # The thorough one takes operators apart first, and may name a part that nobody wrote.
+        # The thorough one takes operators apart first, and may name a part that no user wrote.
         name = next((name for name in refused if name in places), refused[-1])
         public = re.sub(r"^(linalg|fft|special)_", r"\1.", name)
         hint = next((hint for pattern, hint in INSTEAD.items() if re.fullmatch(pattern, name)), OTHERWISE)

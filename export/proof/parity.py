@@ -43,7 +43,7 @@ RULE = (
     "number in the output's row (of value: over all observations), at least 1; also up to 8 times what the "
     "checkpoint's own numbers move by when the observation moves by its last bit"
 )
-"""What the contract says of the tolerances."""
+"""Sentence of the contract on the tolerances."""
 
 
 class GraphLoop:
@@ -172,7 +172,7 @@ def prove(
 
 
 class _Rounding:
-    """How far the framework's own numbers move with the last bit of the observations; asked for when first needed."""
+    """Change in the framework's own numbers when the observations' last bit changes; computed when first needed."""
 
     def __init__(self, references: Sequence[Reference], perturb: Callable[[], list[Reference]] | None) -> None:
         self._references = references
@@ -240,7 +240,7 @@ def _check_form(
     if space is not None:
         dtype = np.dtype(space.dtype) if isinstance(space, Box) else np.dtype(np.int64)
         if got.dtype != dtype:
-            raise ParityError(f"{where}: the action is {got.dtype}, the action space wants {dtype}")
+            raise ParityError(f"{where}: the action is {got.dtype}, the action space has {dtype}")
 
 
 def _compare(
@@ -257,7 +257,7 @@ def _compare(
     """Return (difference, scale), both of the output's shape."""
     a, b = got.astype(np.float64), expected.astype(np.float64)
     with np.errstate(invalid="ignore"):
-        same = (a == b) | (np.isnan(a) & np.isnan(b))  # overflow in both is no difference
+        same = (a == b) | (np.isnan(a) & np.isnan(b))  # overflow in both is not a difference
         difference = np.where(same, 0.0, np.abs(a - b))
     scale = np.maximum(np.where(np.isfinite(b), np.abs(b), 1.0), _scale(b, space, least_scale))
     allowed = RTOL * scale + ATOL
@@ -309,7 +309,7 @@ def _check_choices(
     recipe: Recipe,
     moves: Callable[[], NDArray[np.float64]],
 ) -> None:
-    """Compare discrete actions; a tie in its scores excuses a difference, and so do scores that are no numbers."""
+    """Compare discrete actions; a tie in its scores excuses a difference, and so do scores that are NaN."""
     columns = _columns(reference.outputs[output])
     scored = choice_scores(recipe, reference.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
     for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):

@@ -108,7 +108,7 @@ def observation_step(step: ObservationStep) -> BakedStep:
         parts += [f"the last {step.rewards} rewards"] if step.rewards else []
         return BakedStep(
             step="previous",
-            detail=f"beside the observation: {' and '.join(parts)}; zeros before the episode's start",
+            detail=f"with the observation: {' and '.join(parts)}; zeros before the episode's start",
             values={"actions": step.actions, "rewards": step.rewards},
         )
     return BakedStep(step="user_connector", detail=f"{step.name}, your own")

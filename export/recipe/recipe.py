@@ -29,7 +29,7 @@ class ObservationFilter:
     """
 
     count: int
-    """How many observations the statistics were gathered from."""
+    """Number of observations the statistics were gathered from."""
     mean: NDArray[np.float64]
     """Of the observation's shape, in its units."""
     std: NDArray[np.floating[Any]]
@@ -123,7 +123,7 @@ class Previous:
 
     actions: int
     choices: int
-    """How many actions there are to choose from: the width of a one-hot code."""
+    """Number of actions to choose from: the width of a one-hot code."""
     rewards: int
     keys: tuple[str, str, str] = ("_orig_obs", "prev_n_actions", "prev_n_rewards")
 
@@ -152,10 +152,10 @@ ObservationStep: TypeAlias = (
 )
 
 Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
-"""How the deterministic action comes out of the distribution's parameters (or Q-values), or that it is given."""
+"""Rule from the distribution's parameters (or Q-values) to the deterministic action; or the action is given."""
 
 Transform: TypeAlias = Literal["none", "unsquash", "clip"]
-"""What RLlib does to that action before `env.step`; Box leaves that are not bounded all round are not unsquashed."""
+"""RLlib's step from that action to `env.step`; Box leaves that are not bounded all round are not unsquashed."""
 
 DistributionKind: TypeAlias = Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"]
 
@@ -198,7 +198,7 @@ class Recipe:
     """Of the Box leaves (discrete ones are always argmax); of the whole action where it is only one leaf."""
     transform: Transform
     distribution: DistributionKind | None
-    """None where the module picks its action itself and offers no distribution (DQN)."""
+    """None if the module picks its action itself and offers no distribution (DQN)."""
     network_state: tuple[StateLeaf, ...] = ()
     """A recurrent network's state, in the order the network takes and gives it."""
     action_steps: tuple[UserStep, ...] = ()

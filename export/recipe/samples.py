@@ -33,7 +33,7 @@ NEW_EPISODE = 0.02  # the chance of a row's episode to end at a step, beside the
 class Batch:
     """Observations by input name in the space's dtypes, and what kind they are.
 
-    In a sequence, `restart` says which rows begin an episode; the other rows go on from the batch before. None is a
+    In a sequence, `restart` says which rows begin an episode; the other rows continue from the batch before. None is a
     batch of its own.
     """
 

@@ -2,7 +2,7 @@
 
 RLlib (2.60) passes each environment's observation and action through ten pieces, one by one and each timed, which takes
 as long as the simulator or longer. These give the same numbers, bit by bit. They do where an observation is a Box, an
-action a Box, Discrete or MultiDiscrete, and the network is no LSTM or the like:
+action a Box, Discrete or MultiDiscrete, and the network has no memory:
 
     use_batched_connectors(config, observation_filter=True)
 
@@ -10,7 +10,7 @@ What RLlib does not have are the logarithm of some elements, the sine and cosine
 stacks images).
 
 Two are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
-what was trained with either goes on with the other, and `new_connectors.py` exports both alike. Checkpoints name this
+what was trained with either continues with the other, and `new_connectors.py` exports both alike. Checkpoints name this
 module and its classes: under other names they could not be read.
 """
 
@@ -378,14 +378,14 @@ def _check_box(space: Any) -> Any:
 
 
 def _tensor(rows: list[Any], module: Any, device: Any) -> Any:
-    """Return observations as the network's input, or as an array where there is no network."""
+    """Return observations as the network's input, or as an array if there is no network."""
     stacked = np.array(rows)
     if module is None:
         return stacked
     if module.training:  # RLlib would walk all layers twice a step, to leave training mode and to enter it again
         if module.is_stateful():
             raise UsageError(
-                "the network has a memory (an LSTM, say): the batched connectors have no place for it, RLlib's own do"
+                "the network has memory (such as an LSTM), which the batched connectors do not support: use RLlib's own"
             )
         module.eval()
         module.eval = functools.partial(_evaluate, module)
@@ -441,7 +441,7 @@ def _tell_what_is_new(stats: RunningStat, before: RunningStat | None) -> None:
 
 @functools.cache
 def _check_filter() -> None:
-    """Raise UsageError where this Ray's filter does not do what is written here, bit by bit."""
+    """Raise UsageError if this Ray's filter does not do what is written here, bit by bit."""
     theirs: Any = RunningFilter((3,))
     ours: Any = RunningFilter((3,))
     try:

@@ -40,7 +40,7 @@ REPLACED = (
     ENV_TO_MODULE_SUM_EPISODES_LENGTH_IN,
     ENV_TO_MODULE_SUM_EPISODES_LENGTH_OUT,
 )
-"""What RLlib has noted while it reset the environments: of what is not measured here it would stay for ever."""
+"""Measurements of RLlib while it reset the environments: without measurements here it would never be cleared."""
 
 
 class BatchedEnvRunner(SingleAgentEnvRunner):
@@ -133,7 +133,7 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
         return self.module.forward_exploration(self._cached_to_module, t=of_all_runners)  # type: ignore[no-any-return]
 
     def _step(self, actions: Any) -> Any:
-        """Return the environments' results, or None where one failed and all are made anew, as RLlib does it."""
+        """Return the environments' results, or None if one failed and all are recreated, as RLlib does it."""
         try:
             return self.env.step(actions)
         except Exception as error:
@@ -141,7 +141,7 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
             if not self.config.restart_failed_sub_environments:
                 raise
             if not isinstance(error, StepFailedRecreateEnvError):
-                logger.exception("an environment's step failed: all environments of this runner are made anew")
+                logger.exception("an environment's step failed: all environments of this runner are recreated")
             self.make_env()
             return None
 
@@ -175,7 +175,7 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
             )
 
     def _cut(self) -> list[SingleAgentEpisode]:
-        """Return what there is of the episodes that go on, and let them go on after it."""
+        """Return what there is of the episodes that continue, and let them continue after it."""
         parts = self._ongoing_episodes
         lookback = self.config.episode_lookback_horizon
         self._ongoing_episodes = [part.cut(len_lookback_buffer=lookback) for part in parts]

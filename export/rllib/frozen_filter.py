@@ -22,7 +22,7 @@ def frozen_filter(running: Any) -> ObservationFilter:
 
 
 def why_untrained(files: Files, recipe: Recipe) -> str:
-    """Return why the observation filter's statistics are not training's; '' where they are or there is no filter."""
+    """Return why the observation filter's statistics are not training's; '' if they are or there is no filter."""
     if (frozen := recipe.filter) is None:
         return ""
     seen = f"{frozen.count:,} observation{'' if frozen.count == 1 else 's'}"

@@ -50,14 +50,14 @@ PLUMBING = frozenset({
 BATCHES_OBSERVATION = frozenset({"AddObservationsFromEpisodesToBatch", "FrameStacking"})
 """Pieces that put the observation into the batch: what a later one changes in the episode comes too late."""
 BATCHED_CONNECTORS = "rlservo.export.rllib.batched_connectors"
-"""Pieces that do what RLlib's of the same names do; those for observations batch them, too."""
+"""Pieces that do what RLlib's of the same names do; those for observations also batch them."""
 
 HOOK = "torch_forward"
 
 
 @dataclass(frozen=True)
 class AgentSlot:
-    """An agent's place in pipelines that serve several; `agent` None where there is only one."""
+    """An agent's place in pipelines that serve several; `agent` None if there is only one."""
 
     agent: Any = None
     module: str = ""
@@ -143,7 +143,7 @@ def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> Ob
             raise CheckpointError(
                 f"{files.env_to_module / kind.__name__} is missing: the observation filter's statistics"
             )
-        private_names.replace(piece, "_update_stats", False)  # it would go on learning from whatever it is shown
+        private_names.replace(piece, "_update_stats", False)  # it would continue learning from whatever it is shown
         return None if isinstance(space, Discrete | MultiDiscrete) else _filter(piece, space, slot)
     if kind.__name__ == "FlattenObservations":
         flattened = private_names.get(piece, "_agent_ids")  # none: all agents'

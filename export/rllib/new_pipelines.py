@@ -41,10 +41,10 @@ class Pipelines:
     observation_space: Any
     action_space: Any
     connector_module: Any
-    """What RLlib hands to its connectors: the module, or a MultiRLModule that holds it alone."""
+    """Argument of RLlib's connectors: the module, or a MultiRLModule that holds it alone."""
 
     def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return (the module's batch, what the pipelines tell each other)."""
+        """Return (the module's batch, what the pipelines pass to each other)."""
         shared: dict[str, Any] = {}
         with torch.no_grad():
             batch = self.env_to_module(
@@ -84,7 +84,7 @@ class MultiAgentPipelines(Pipelines):
     slot: AgentSlot
 
     def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return (the module's batch, what the pipelines tell each other)."""
+        """Return (the module's batch, what the pipelines pass to each other)."""
         batch, shared = super().to_module(episodes)
         return batch[self.slot.module], shared
 
@@ -129,10 +129,10 @@ def pipelines_of(
 
 
 def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, module_to_env: Any) -> AgentSlot:
-    """Return for which agent a module is exported; SINGLE_AGENT where the environment has only one.
+    """Return for which agent a module is exported; SINGLE_AGENT if the environment has only one.
 
     A module may serve several: any stands for all where their spaces and the steps before the network are the same.
-    Raises CheckpointError when there is no such agent, AgentsDifferError where they differ and none was named, and
+    Raises CheckpointError when there is no such agent, AgentsDifferError if they differ and none was named, and
     UnsupportedError for modules that compute together.
     """
     mapping = next((piece for piece in env_to_module.connectors if type(piece).__name__ == MAPPING), None)
@@ -166,7 +166,7 @@ def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, mod
 def _served(mapping: Any, module_id: str, module: Any) -> list[Any]:
     """Return the agents that a module serves, as RLlib asks it.
 
-    All that it could serve where that is drawn in each episode, or where the module was added in training.
+    All that it could serve if that is drawn in each episode, or where the module was added in training.
     """
     agents = list(mapping.input_observation_space.spaces)
     module_of = private_names.get(mapping, "_agent_to_module_mapping_fn")
@@ -192,7 +192,7 @@ def _treatment(slot: AgentSlot, files: CheckpointFiles, env_to_module: Any, modu
 
 
 def _check_separate(files: CheckpointFiles) -> None:
-    """Raise UnsupportedError where the modules are parts of something of the user's own, which may mix them."""
+    """Raise UnsupportedError if the modules are parts of something of the user's own, which may mix them."""
     if not files.together.is_file():
         return
     kind = unpickle(files.together).get("class")

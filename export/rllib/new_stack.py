@@ -80,10 +80,10 @@ PIPELINE_SETTINGS = (
     "observation_space",
     "action_space",
 )
-"""What of an algorithm's configuration decides its connector pipelines (ray 2.60)."""
+"""Settings of an algorithm that decide its connector pipelines (ray 2.60)."""
 REFUSED_MODULES = {
     "DreamerV3TorchRLModule": "DreamerV3 draws its world model's state at random in every step, exploring or not, so "
-    "there is no one action to prove an export with",
+    "no single action can prove an export",
 }
 """Modules of RLlib's own that can be restored and not exported, and why."""
 QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn/default_dqn_rl_module.py
@@ -169,7 +169,7 @@ class NewStackLoop:
         return {name: np.concatenate([one[name] for one in outputs]) for name in outputs[0]}
 
     def _decide(self, episodes: list[Any]) -> Outputs:
-        """Return what RLlib computes for these episodes, and remember what they have to be told with the next step."""
+        """Return what RLlib computes for these episodes, and remember what they need with the next step."""
         batch, shared = self.pipelines.to_module(episodes)
         forward = self.pipelines.forward(batch)
         outputs = self._outputs(batch, forward)
@@ -341,7 +341,7 @@ def _explained(folder: Path) -> Iterator[None]:
 
 
 def _other_ray(folder: Path) -> str:
-    """Return what to do where another Ray wrote a part that this one cannot read; empty where it was this one."""
+    """Return what to do where another Ray wrote a part that this one cannot read; empty if it was this one."""
     try:
         written_by = str(json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["ray_version"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -362,7 +362,7 @@ def _not_rllibs_own(record: logging.LogRecord) -> bool:
 def _check_weights(files: CheckpointFiles, module: Any) -> str:
     """Return '' when every weight was in the checkpoint, or why the value head has none.
 
-    RLlib ignores weights that are missing and leaves them random. Raises CheckpointError where an action needs them,
+    RLlib ignores weights that are missing and leaves them random. Raises CheckpointError if an action needs them,
     and where training has diverged.
     """
     unneeded = _unneeded(module)

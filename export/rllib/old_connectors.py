@@ -38,7 +38,7 @@ def check_connectors(state: Mapping[str, Any]) -> None:
     for side, known in KNOWN.items():
         if side not in configs:
             raise UnsupportedError(
-                f"the checkpoint holds no {side} connectors, so it does not tell what RLlib does to "
+                f"the checkpoint holds no {side} connectors, so it does not show what RLlib does to "
                 f"{'observations' if side == 'agent' else 'actions'}: it was written by an early Ray or with "
                 "connectors switched off; restore it in Ray 2.7 or later and save it again"
             )
@@ -56,7 +56,7 @@ def read_old_steps(agent_connectors: Any) -> tuple[ObservationStep, ...]:
 
     Raises UnsupportedError for a preprocessor that is not exported, CheckpointError for a filter that diverged.
     """
-    agent_connectors.in_eval()  # a restored filter goes on learning from whatever it is shown
+    agent_connectors.in_eval()  # a restored filter continues learning from whatever it is shown
     steps: list[ObservationStep] = []
     for piece in agent_connectors.connectors:
         name = type(piece).__name__

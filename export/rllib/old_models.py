@@ -33,7 +33,7 @@ class Registration:
     """A call `register_custom_model(name, class)`, or of a distribution, in the user's code."""
 
     module: str
-    """Where the class is defined, as it is imported."""
+    """Module of the class, as it is imported."""
     attribute: str
 
 

@@ -254,8 +254,8 @@ def _check_policy(files: OldStackFiles, policy: Any) -> None:
             )
     if any(isinstance(part, NoisyLayer) for part in policy.model.modules()):
         raise UnsupportedError(
-            f"model {model} has noisy layers (noisy=True), which RLlib's old stack draws anew for every action, "
-            "exploring or not: there is no one action to prove an export with"
+            f"model {model} has noisy layers (noisy=True), which RLlib's old stack draws again for every action, "
+            "exploring or not: no single action can prove an export"
         )
     if isinstance(policy.exploration, ParameterNoise):
         raise UnsupportedError(

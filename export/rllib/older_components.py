@@ -13,7 +13,7 @@ from rlservo.export.contract.errors import UnsupportedError
 from rlservo.export.rllib import private_names
 
 UNCHANGED = (2, 48)
-"""From this Ray on, what `Checkpointable.from_checkpoint` reads has not changed."""
+"""First Ray whose checkpoints `Checkpointable.from_checkpoint` reads as today's."""
 CONFIG_OBJECT = "RLModuleConfig"
 """Up to Ray 2.38 a module was made from one of these, which holds what are arguments today."""
 CONSTANT = "log_std_clip_param_const"

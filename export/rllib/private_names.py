@@ -15,7 +15,7 @@ KNOWN = "2.60"
 
 
 def find(module: str, name: str) -> Any:
-    """Return what a module of Ray calls so. Raises UnsupportedError where this Ray has no such thing."""
+    """Return what a module of Ray calls so. Raises UnsupportedError if this Ray has no such thing."""
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError):
@@ -23,7 +23,7 @@ def find(module: str, name: str) -> Any:
 
 
 def get(owner: Any, name: str) -> Any:
-    """Return an object's attribute. Raises UnsupportedError where this Ray's has none of that name."""
+    """Return an object's attribute. Raises UnsupportedError if this Ray's has none of that name."""
     try:
         return getattr(owner, name)
     except AttributeError:

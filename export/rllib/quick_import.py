@@ -28,7 +28,7 @@ ELSEWHERE = {
     ("ray.train", "Checkpoint"): "ray.train._checkpoint",
     ("ray.tune", "Checkpoint"): "ray.tune.trainable.trainable_fn_utils",
 }
-"""The modules that define names which RLlib asks deferred packages for, to tell a checkpoint from a path (ray 2.60)."""
+"""Modules with names that RLlib needs from deferred packages, to distinguish a checkpoint from a path (ray 2.60)."""
 NEEDED = (
     "rlservo.export.rllib.new_stack",  # and what it imports of RLlib's
     "ray.rllib.connectors.env_to_module",
@@ -55,7 +55,7 @@ def prepare() -> None:
 
 
 def _load_torch_library() -> None:
-    """Map torch's libraries. Where they are elsewhere or cannot be loaded, torch's own import finds out and says so."""
+    """Map torch's libraries. Where they are elsewhere or cannot be loaded, torch's own import reports it."""
     spec = find_spec("torch")
     for folder in (spec and spec.submodule_search_locations) or ():
         with contextlib.suppress(OSError):
@@ -158,7 +158,7 @@ def _run(package: ModuleType) -> None:
     try:
         spec.loader.exec_module(package)
     except BaseException:
-        _set_class(package, _DeferredPackage)  # whoever asks next sees the reason as well
+        _set_class(package, _DeferredPackage)  # the next caller sees the reason as well
         raise
 
 

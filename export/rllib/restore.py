@@ -21,7 +21,7 @@ def restore(files: Files, app_dir: Path, notify: Callable[[str], None], *, value
     Starts nothing: no `ray.init`, no environment, no worker. Raises CheckpointError when the policy cannot be read,
     UnsupportedError when exporting it would lose something.
     """
-    # Imported here: a Ray without the old API stack goes on reading the new one's checkpoints.
+    # Imported here: a Ray without the old API stack continues reading the new one's checkpoints.
     if isinstance(files, OldStackFiles):
         from rlservo.export.rllib.old_stack import restore_old_stack
 

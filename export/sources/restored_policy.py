@@ -60,8 +60,8 @@ class RestoredPolicy:
     start_loop: Callable[[], Loop]
     """Start the framework acting step after step, exploration off and filter frozen: what an export is compared to."""
     agents: tuple[str, ...] = ()
-    """The agents of an environment with several that it is for; empty where there is one, or all are alike."""
+    """The agents of an environment with several that it is for; empty if there is one, or all are alike."""
     elements: ElementNames | None = None
-    """What the checkpoint says of its elements; None where the environment's class may be asked."""
+    """Names of its elements in the checkpoint; None if the environment's class has them."""
     untrained_filter: str = ""
-    """Why the observation filter's statistics are not training's; '' where they are or there is no filter."""
+    """Why the observation filter's statistics are not training's; '' if they are or there is no filter."""

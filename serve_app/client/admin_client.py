@@ -28,7 +28,7 @@ class AdminClient(Closeable):
         self._transport = Transport(url, timeout_s=timeout_s, retries=0, api_key=api_key)
 
     def replicas(self) -> list[dict[str, Any]]:
-        """Return what every replica serves, as its `GET /v1/policies` would tell."""
+        """Return what every replica serves, as its `GET /v1/policies` would."""
         listings: list[dict[str, Any]] = self._transport.get("v1", "admin", "policies")
         return listings
 
@@ -96,5 +96,5 @@ def find_key(url: str, file: Path | None) -> str:
         return read_key(local)
     raise UsageError(
         f"administration needs an admin key: name its file with --key-file or set {KEY_VARIABLE} "
-        "('rlservo serve' writes one and says where; 'rlservo key LABEL --admin' makes one for other servers)"
+        "('rlservo serve' writes one and prints where; 'rlservo key LABEL --admin' makes one for other servers)"
     )

@@ -88,7 +88,7 @@ class ClientEpisode:
         return fields
 
     def end_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any] | None:
-        """Return what the request that tells the episode's end says of it; None where there is nothing to end.
+        """Return the fields of the request that reports the episode's end; None if there is nothing to end.
 
         Raises SessionLostError.
         """
@@ -106,7 +106,7 @@ class ClientEpisode:
             self._session_id = uuid.uuid4().hex
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
-        """Go on to the next step after a reply; `action` is the reply's, in the form in which it would be sent.
+        """Continue to the next step after a reply; `action` is the reply's, in the form in which it would be sent.
 
         Raises SessionLostError when the reply is of another episode, UnavailableError when it lacks the state.
         """

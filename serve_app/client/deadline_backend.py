@@ -37,7 +37,7 @@ class DeadlineBackend(httpcore.NetworkBackend):
         self._local.deadline = value
 
     def remaining(self, timeout: float | None, kind: type[Exception]) -> float | None:
-        """Return what is left of `timeout` and the deadline; raise `kind` where that is nothing."""
+        """Return what is left of `timeout` and the deadline; raise `kind` if that is nothing."""
         if self.deadline is None:
             return timeout
         remaining_s = self.deadline - time.monotonic()

@@ -100,7 +100,7 @@ class Transport:
 
     @property
     def reconnects(self) -> int:
-        """How many connections were made after the first."""
+        """Number of connections after the first."""
         return max(0, self._backend.connections - 1)
 
     def get(self, *path: str, timeout_s: float | None = None, retries: int | None = None) -> Any:
@@ -157,7 +157,7 @@ class Transport:
                 failure.retry_after_s = _retry_after_s(headers)
                 if wait is not None and failure.retry_after_s is not None:
                     wait = failure.retry_after_s
-            # Waiting longer than the caller will is no use: say so now.
+            # Waiting longer than the caller is useless: report it now.
             if wait is None or time.monotonic() + wait >= deadline:
                 raise failure
             time.sleep(wait)
@@ -261,7 +261,7 @@ def _connection_pool(url: str, backend: DeadlineBackend, proxy: str | None) -> h
     address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
     if parts.scheme not in PROXIES:
         raise UsageError(
-            f"a proxy of the environment begins with {parts.scheme!r}: expected for example 'http://proxy:3128'"
+            f"a proxy in the environment variables begins with {parts.scheme!r}: expected for example 'http://proxy:3128'"
         )
     return PROXIES[parts.scheme](address, user, **options)
 

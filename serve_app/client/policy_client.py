@@ -39,7 +39,7 @@ class PolicyClient(RemotePolicy):
     began it. With `version` the loop stays with that one; an alias is looked up at the first contact.
 
     Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
-    A recurrent policy's state is kept here and sent along, and so is the last action where the server limits the step
+    A recurrent policy's state is kept here and sent along, and so is the last action if the server limits the step
     from it: such a client belongs to one loop, and no replica that dies takes its memory along. With `server_state` the
     memory stays with the server instead, in a session of this client, which is worth it for large states (frames of a
     camera) and raises SessionLostError when the server has lost it.
@@ -61,11 +61,11 @@ class PolicyClient(RemotePolicy):
     ) -> None:
         """Check the arguments; the server is first asked when `contract` or `act` needs it.
 
-        `policy` may be None where the server has exactly one. `timeout_s` bounds one call, its retries included, and
+        `policy` may be None if the server has exactly one. `timeout_s` bounds one call, its retries included, and
         `deadline_ms` instead of it each `act`; `retries` counts further attempts after a failed connection or a 503,
         nothing else is ever sent twice. `record` keeps every decision: a new .mcap file, a folder, or a Recorder.
         `label` names this loop: in the server's own recording, what it asks from `reset` to `reset` is one episode,
-        with a random name where there is no label. Threads that share a client share its episode.
+        with a random name if there is no label. Threads that share a client share its episode.
         """
         if label is not None and not (label and label.isascii() and label.isprintable() and len(label) <= 100):
             raise UsageError(f"label must be 1 to 100 printable ASCII characters, got {label[:100]!r}")
@@ -84,11 +84,11 @@ class PolicyClient(RemotePolicy):
 
     @property
     def reconnects(self) -> int:
-        """How many connections were made after the first."""
+        """Number of connections after the first."""
         return self._transport.reconnects
 
     def reset(self) -> None:
-        """Start an episode: the next request says so. Sends nothing."""
+        """Start an episode: the next request carries it. Sends nothing."""
         super().reset()
         self._begin_label()
 

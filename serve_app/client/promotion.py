@@ -1,7 +1,7 @@
 """Promotion of a version: a canary that is watched, and then put into production or ended.
 
 It uses the commands that operators use and the metrics that Prometheus reads, and keeps nothing on the server. Its
-state is its log: each step is written there before it is made, so that the same promotion started again goes on.
+state is its log: each step is written there before it is made, so that the same promotion started again continues.
 Changes that others make to the policy meanwhile stay: then it stops, and undoes no more than its own changes.
 """
 
@@ -47,7 +47,7 @@ class Outcome:
     outcome: str
     why: str
     is_finished: bool = True
-    """Whether the server is as it says; if not, the same promotion started again goes on."""
+    """Whether the server is as it says; if not, the same promotion started again continues."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Promotion:
         self._logged_at = -math.inf
 
     def run(self) -> Outcome:
-        """Watch and decide. Raises RlservoError where nothing has begun: bad input, or a server out of reach."""
+        """Watch and decide. Raises RlservoError if nothing has begun: bad input, or a server out of reach."""
         is_new, decided = not self._log.entries, None
         try:
             if is_new:
@@ -121,7 +121,7 @@ class Promotion:
             self._say(error.message)  # started again it finds nothing left to do
         return outcome
 
-    # Begin, or go on.
+    # Begin, or continue.
 
     def _begin(self) -> None:
         """Check what is served, and count from here on."""
@@ -131,7 +131,7 @@ class Promotion:
             raise UsageError(f"no policy '{name}' is served: see 'rlservo policy list'")
         if version not in served.versions:
             raise UsageError(
-                f"policy '{name}' has no version {version}: loaded are {', '.join(served.versions)}; "
+                f"policy '{name}' has no version {version}: expected one of {', '.join(served.versions)}; "
                 f"'rlservo policy load {name} {version}' loads it"
             )
         if served.production == version:
@@ -154,7 +154,7 @@ class Promotion:
         )
 
     def _start(self) -> Outcome | None:
-        """Start the shadow and the canary; return the outcome where that is impossible."""
+        """Start the shadow and the canary; return the outcome if that is impossible."""
         terms = self._terms
         name, version = terms.policy, terms.version
         try:
@@ -187,7 +187,7 @@ class Promotion:
             outcome = Outcome(decision["outcome"], decision["why"]) if decision else None
         except (KeyError, TypeError, ValueError) as error:
             raise UsageError(f"{self._log.path} cannot be read ({error!r}): name another --log") from None
-        self._say(f"goes on: {_duration(self._remaining)} are left")
+        self._say(f"continues: {_duration(self._remaining)} are left")
         return outcome
 
     # Watch.
@@ -228,7 +228,7 @@ class Promotion:
         return ""
 
     def _judge(self) -> Outcome | None:
-        """Write down what was counted; return the outcome where there is one."""
+        """Write down what was counted; return the outcome if there is one."""
         terms, remaining = self._terms, self._remaining
         found = list(figures(terms.limits, self._counts.total, self._production, terms.version))
         surely, all_of_it = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
@@ -243,7 +243,7 @@ class Promotion:
         return Outcome(ROLLED_BACK, "; ".join(map(str, against))) if against else Outcome(PROMOTED, all_of_it)
 
     def _changed(self, served: _Served | None) -> str:
-        """Return what somebody else has changed of what is watched, in a sentence."""
+        """Return a sentence on what another command has changed."""
         terms, what = self._terms, ""
         if served is None:
             return f"policy '{terms.policy}' is no longer served"
@@ -255,7 +255,7 @@ class Promotion:
             what = f"the canary is {served.canary} and no longer {self._canary}"
         elif self._shadow not in ("none", served.shadow):
             what = f"the shadow is {served.shadow} and no longer {self._shadow}"
-        return f"somebody else has changed what is served: {what} ({served.last_change})" if what else ""
+        return f"another command has changed what is served: {what} ({served.last_change})" if what else ""
 
     # Carry out what was decided.
 
@@ -299,7 +299,7 @@ class Promotion:
     def _unfinished(self, outcome: Outcome, why: str) -> Outcome:
         return Outcome(
             STOPPED,
-            f"{outcome.why}; but this could not be carried out ({why}): the same promotion, started again, goes on; "
+            f"{outcome.why}; but this could not be carried out ({why}): the same promotion, started again, continues; "
             f"'rlservo policy canary {self._terms.policy} off' ends a canary that still runs",
             is_finished=False,
         )
@@ -307,7 +307,7 @@ class Promotion:
     # Ask the servers.
 
     def _served(self) -> _Served | None:
-        """Return the plan of the policy; None where it is not served. Raises RlservoError, also for an older plan."""
+        """Return the plan of the policy; None if it is not served. Raises RlservoError, also for an older plan."""
         with self._connect(self._terms.urls[0]) as client:
             listing = client.listing()
         try:

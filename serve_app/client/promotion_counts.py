@@ -16,7 +16,7 @@ from rlservo.export.contract.errors import UnavailableError
 
 ANSWERS, OUTCOMES, ENDS = "rlservo_request_seconds_bucket", "rlservo_requests_total", "rlservo_episode_ends_total"
 DIFFERENCES, MISSED = "rlservo_shadow_difference_bucket", "rlservo_shadow_missed_total"
-COUNTED = {  # the labels that tell a policy's series apart; those of other labels are summed
+COUNTED = {  # the labels that distinguish a policy's series; those of other labels are summed
     ANSWERS: ("version", "le"),
     OUTCOMES: ("version", "code"),
     ENDS: ("version", "outcome"),
@@ -67,7 +67,7 @@ def read_metrics(text: str, policy: str) -> dict[str, Process]:
             counts = [count for _, count in buckets(process.numbers, ANSWERS, version)]
             answered = process.numbers.get(f"{OUTCOMES}/{version}/ok", 0.0)
             if counts != sorted(counts) or answered > max(counts, default=0.0):
-                raise UntrustedError(f"replica '{replica}' contradicts itself in what version {version} has answered")
+                raise UntrustedError(f"replica '{replica}' reports contradictory counts for version {version}")
     return processes
 
 

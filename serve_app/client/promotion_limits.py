@@ -38,7 +38,7 @@ CLIENTS_OWN = frozenset(  # failures that say nothing of the version that was as
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of one promotion; None is no limit."""
+    """Limits of one promotion; None for no limit."""
 
     error_rate: float | None = None
     p99_s: float | None = None
@@ -57,7 +57,7 @@ class Figure:
     cases: float
     allowed: float  # share of the cases
     lacks: str = ""  # what is missing to decide by it
-    surely: float = 0.0  # share that is surely too large, where that is more than `allowed`
+    surely: float = 0.0  # share that is surely too large, if that is more than `allowed`
 
     @property
     def is_beyond(self) -> bool:

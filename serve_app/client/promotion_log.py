@@ -1,4 +1,4 @@
-"""Log of a promotion: JSON lines, each check with its figures and counts, from which a killed promotion goes on."""
+"""Log of a promotion: JSON lines, each check with its figures and counts, from which a killed promotion continues."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class PromotionLog:
                 self._add({**entry, "seconds": datetime.fromisoformat(entry["time"]).timestamp()})
             except (ValueError, KeyError, TypeError):
                 if not number:
-                    raise UsageError(f"{path} is no promotion's log: name another --log") from None
+                    raise UsageError(f"{path} is not a promotion's log: name another --log") from None
 
     @classmethod
     @contextlib.contextmanager
     def open(cls, path: Path) -> Iterator[PromotionLog]:
-        """Open a log, made if it is not there. Raises UsageError where it is no log or another process writes it."""
+        """Open a log, made if it is not there. Raises UsageError if it is not a log or another process writes it."""
         try:
             file = path.open("a+b", buffering=0)
         except OSError as error:

@@ -1,7 +1,7 @@
 """Base of the HTTP and the WebSocket client of a policy: contract, episode, recording, arguments of a request.
 
 A client that was given no version asks by the policy's name and follows what the server answers with: the alias
-`production`, and a canary's share, as everybody does. What remembers an episode stays with the version that began it
+`production`, and a canary's share, as all clients do. What remembers an episode stays with the version that began it
 (the server sees to that), and an answer of a version with other spaces is never used.
 """
 
@@ -65,7 +65,7 @@ class RemotePolicy(ActingPolicy):
         if deadline_ms is not None and not deadline_ms > 0:
             raise UsageError(f"deadline_ms must be above 0, got {deadline_ms}")
         if policy == "":
-            raise UsageError("the policy's name is empty: give a name, or None where the server has only one policy")
+            raise UsageError("the policy's name is empty: give a name, or None if the server has only one policy")
         if version is not None and policy is None:
             raise UsageError(f"version {version!r} was given without the policy's name")
         self._name = policy
@@ -77,7 +77,7 @@ class RemotePolicy(ActingPolicy):
         self._contracts: dict[str, Contract] = {}
         """Of every version that was met."""
         self._reward: float | None = None
-        """What the last action brought, for the next request."""
+        """Result of the last action, for the next request."""
         self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
         self.last_reply: dict[str, Any] = {}
         """The server's reply to the last request that got an action."""
@@ -155,7 +155,7 @@ class RemotePolicy(ActingPolicy):
             self._recording.record_command(action)
 
     def reset(self) -> None:
-        """Start an episode: the next request says so. Sends nothing."""
+        """Start an episode: the next request carries it. Sends nothing."""
         self._episode.reset()
         self._reward = None
         if self._recording is not None:
@@ -192,7 +192,7 @@ class RemotePolicy(ActingPolicy):
 
     @abstractmethod
     def _tell_end(self, request: dict[str, Any]) -> None:
-        """Send a request whose action is for nobody."""
+        """Send a request whose action is not used."""
         ...
 
     @abstractmethod
@@ -230,7 +230,7 @@ class RemotePolicy(ActingPolicy):
     def _answering_contract(self, reply: Any, number: int, deadline: float) -> Contract:
         """Return the contract of the version that answered request `number`.
 
-        Raises UnavailableError where it is the answer to another request, or of a version that this client was not made
+        Raises UnavailableError if it is the answer to another request, or of a version that this client was not made
         for, and DeadlineError.
         """
         contract = self.contract
@@ -282,7 +282,7 @@ class RemotePolicy(ActingPolicy):
         return request, batch
 
     def _parse_contract(self, document: Any) -> Contract:
-        """Return the contract that the server sent; raise UnavailableError where it cannot be one."""
+        """Return the contract that the server sent; raise UnavailableError if it cannot be one."""
         try:
             return Contract.model_validate(document)
         except ValidationError as error:

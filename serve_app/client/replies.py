@@ -71,7 +71,7 @@ def check_step(reply: Mapping[str, Any], steps: int) -> int:
 
 
 def next_state(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
-    """Return the state for the next request; raise UnavailableError where the server gave none."""
+    """Return the state for the next request; raise UnavailableError if the server gave none."""
     state = reply.get("state")
     if state is None and not contract.state:
         return {}  # what had to be carried has not to be any more

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 SCHEMES = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}
 WAIT_S = 0.02  # between two attempts to connect within one call
-SILENT_FACTOR, SILENT_S = 3.0, 0.5  # a connection that gave no byte for so many deadlines, and so long, is made anew
+SILENT_FACTOR, SILENT_S = 3.0, 0.5  # a connection that gave no byte for so many deadlines, and so long, is replaced
 
 
 class StreamClient(RemotePolicy):
@@ -72,8 +72,8 @@ class StreamClient(RemotePolicy):
     ) -> None:
         """Check the arguments; nothing is sent before `contract` or `act` needs it.
 
-        `policy` may be None where the server has a default policy. `timeout_s` bounds the first contact, `deadline_ms`
-        (by default the same) each `act`, in which a broken connection is made anew. `record` keeps every decision: a
+        `policy` may be None if the server has a default policy. `timeout_s` bounds the first contact, `deadline_ms`
+        (by default the same) each `act`, in which a broken connection is replaced. `record` keeps every decision: a
         new .mcap file, a folder, or a Recorder.
         """
         self.url = parse_address(url, SCHEMES)
@@ -95,7 +95,7 @@ class StreamClient(RemotePolicy):
 
     @property
     def reconnects(self) -> int:
-        """How many connections were made after the first."""
+        """Number of connections after the first."""
         return max(0, self._connections - 1)
 
     def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
@@ -117,7 +117,7 @@ class StreamClient(RemotePolicy):
                     raise
                 continue  # asking twice does no harm: no memory of ours has survived on the other side
             except StateNeededError:
-                self._disconnect()  # of another version than the connection began with: the next one tells its contract
+                self._disconnect()  # of another version than the connection began with: the next one sends its contract
                 version = contract.version
                 self._connected(deadline)
                 if self.contract.version == version:
@@ -233,7 +233,7 @@ class StreamClient(RemotePolicy):
         except RlservoError:
             metadata = None
         if not isinstance(metadata, dict):
-            raise UnavailableError(f"{self.url} did not begin with a contract: is it another version of rlservo?")
+            raise UnavailableError(f"{self.url} did not send a contract first: is it another version of rlservo?")
         return self._parse_contract(metadata.get("contract"))
 
     def _disconnect(self) -> None:

@@ -33,7 +33,7 @@ class WebSocket:
     def __init__(self, url: str, *, api_key: str | None, deadline: float, label: str) -> None:
         """Connect and shake hands by `deadline` (`time.monotonic`).
 
-        `label` says whose connection it is: where a canary runs, all of a label get the same version.
+        `label` says whose connection it is: when a canary runs, all of a label get the same version.
 
         Raises BrokenError, or HandshakeError when the server answers with an HTTP error.
         """
@@ -93,8 +93,8 @@ class WebSocket:
     def receive(self, deadline: float) -> bytes | str:
         """Return the next message.
 
-        Raises DeadlineError when it was not complete in time (the connection stays, and a later call goes on where this
-        one stopped), or BrokenError when the connection is gone.
+        Raises DeadlineError when it was not complete in time (the connection stays, and a later call
+        continues), or BrokenError when the connection is gone.
         """
         while True:
             while self._events:
@@ -152,7 +152,7 @@ class WebSocket:
 
 
 class BrokenError(UnavailableError):
-    """There is no connection, or none any more: another one may be made."""
+    """The connection is missing or closed: another one may be made."""
 
     code = "connection-broken"
 

@@ -38,7 +38,7 @@ class Load:
 
 
 def _wanted_by_thread() -> dict[str, float]:
-    """Return the seconds each thread ran or waited to run, of this process; where Linux does not tell, what it ran."""
+    """Return the seconds each thread of this process ran or waited to run (only ran, if Linux reports no waiting)."""
     found = {}
     for file in Path("/proc/self/task").glob("*/schedstat"):
         with contextlib.suppress(OSError, ValueError):  # a thread may end meanwhile

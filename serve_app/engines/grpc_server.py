@@ -16,7 +16,7 @@ from rlservo.serve_app.wire.loopback import is_loopback
 
 LONGEST_S = 86400.0  # [s] gRPC expresses "no deadline" as one far away
 DRAIN_S = 5.0
-OVERHEAD_BYTES = 4096  # of a message beside what `max_body_bytes` bounds
+OVERHEAD_BYTES = 4096  # of a message in addition to `max_body_bytes`
 MAX_CALLS = 1024
 
 
@@ -48,7 +48,7 @@ class GrpcServer:
             _add_reflection(self._server)
 
     async def start(self) -> None:
-        """Listen, and report to be serving. Raises UnavailableError where the port cannot be listened on."""
+        """Listen, and report to be serving. Raises UnavailableError if the port cannot be listened on."""
         try:
             self._server.add_insecure_port(self._address)
         except RuntimeError as error:

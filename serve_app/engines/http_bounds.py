@@ -193,7 +193,7 @@ class BoundedHttp(HttpToolsProtocol):
         is_websocket = headers.get(b"upgrade", b"").lower() == b"websocket" and method == b"GET"
         has_body = headers.get(b"content-length", b"0") != b"0" or b"transfer-encoding" in headers
         if not is_websocket or has_body:
-            self._refuse("the header Upgrade is supported for a WebSocket only, which begins with a GET without a body")
+            self._refuse("the header Upgrade is supported only for a WebSocket, which begins with a GET without a body")
 
     def _refuse(self, sentence: str) -> None:
         self._sentence = sentence

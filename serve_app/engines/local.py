@@ -90,7 +90,7 @@ def serve_policies(
 
     In the main thread this takes over SIGINT, SIGTERM and SIGHUP while it runs; in another thread, where there can only
     be one worker, `stop` ends it. Raises UsageError or BundleError where something is wrong from the start, and
-    UnavailableError where a port or a storage cannot be had.
+    UnavailableError if a port or a storage cannot be had.
     """
     if workers < 1:
         raise UsageError(f"workers must be 1 or more, got {workers}")
@@ -101,7 +101,9 @@ def serve_policies(
     ServedConfig.parse(dict(served or {}))
     keys = check_exposure(host, chosen)
     if not keys.keys and not is_loopback(host):
-        logger.warning("listening on %s without authentication: whoever reaches this port can ask for actions", host)
+        logger.warning(
+            "listening on %s without authentication: anyone who can reach this port can request actions", host
+        )
     if keys.operator is not None or any(key.role is Role.admin for key in keys.keys):
         admin_key_file = None
     _raise_descriptor_limit()
@@ -301,7 +303,7 @@ def _run_workers(
     ready: Callable[[Sequence[tuple[str, str]]], None],
     on_stop: Callable[[], None] | None,
 ) -> None:
-    # What is wrong with the policies is told here, once, before any worker starts.
+    # What is wrong with the policies is reported here, once, before any worker starts.
     with contextlib.closing(load_served(server.places, ServedConfig.parse(server.served), server.settings)) as store:
         policies = tuple((name, store.default(name)) for name in store.names)
     UVICORN.setLevel(logging.INFO)
@@ -309,7 +311,7 @@ def _run_workers(
         supervisor = _Supervisor(server.config(), [listener], lambda: ready(policies), on_stop)
         supervisor.run()
     if not supervisor.is_asked_to_stop:
-        raise UnavailableError("a worker could not start: the lines above say why")
+        raise UnavailableError("a worker could not start: see the lines above")
 
 
 class _Supervisor(Multiprocess):

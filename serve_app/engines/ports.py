@@ -21,7 +21,7 @@ def listen(host: str, port: int, *, option: str = "--port") -> socket.socket:
     except OSError as error:
         raise UsageError(f"host '{host}' is not an address of this machine: {error.strerror}") from error
     listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # closed connections lingering are no obstacle
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # lingering closed connections do not matter
     try:
         _check_route(family, address)
         listener.bind(address)

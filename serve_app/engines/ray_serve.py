@@ -202,7 +202,7 @@ def _plain(error: RlservoError) -> RuntimeError:
 
 
 def _listening_host() -> str:
-    """Return the address that Serve's HTTP options name; every address where Serve does not tell.
+    """Return the address that Serve's HTTP options name; every address if Serve does not report one.
 
     Serve has no public question for it. Its controller has a well-known name and answers; a Serve whose controller is
     another one is taken to listen everywhere, which asks for API keys.

@@ -16,7 +16,7 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 
 class Serving:
-    """What one process serves: an engine makes it, starts it in its event loop, and stops it there."""
+    """Application, policies and gRPC of one process; an engine starts and stops them in its event loop."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class Serving:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self, served: Any) -> None:
-        """Load and prove what the plan says, or where there is none `served` (ServedConfig).
+        """Load and prove what the plan says, or if there is none `served` (ServedConfig).
 
         Raises UsageError, BundleError and UnavailableError.
         """

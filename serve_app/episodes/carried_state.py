@@ -31,7 +31,7 @@ class CarriedState:
     """An episode begins."""
 
     policy_identity: str | None = None
-    """The identity of the policy that gave it; None where the client has dropped it."""
+    """The identity of the policy that gave it; None if the client has dropped it."""
 
     last_action: Any = None
 

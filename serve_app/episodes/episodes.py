@@ -63,14 +63,14 @@ class Episodes:
         """Decide for a request that says something of its episode, or came on a stream that keeps one.
 
         Only a session in a shared store is waited for. Raises SessionError, SessionLostError, RequestError,
-        UnavailableError where nothing more can be remembered or the store cannot be reached, and what `Policy.step`
+        UnavailableError if nothing more can be remembered or the store cannot be reached, and what `Policy.step`
         raises; the recurrent state has then not moved on.
         """
         episode, stream = request.episode or NO_EPISODE, request.stream
         if episode.final_status is not None and (episode.reset or (episode.state is not None and not episode.state)):
             raise RequestError(
-                "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): tell how "
-                "the last one ended in a request of its own, before"
+                "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): "
+                "report how the last one ended in a separate request before it"
             )
         if episode.session_id is not None:
             request.label = str(episode.session_id)
@@ -80,7 +80,7 @@ class Episodes:
             episode = replace(episode, session_id=None, reset=False, end=False)
         if episode.end or (episode.reset and request.stream_id is None):
             word = "end" if episode.end else "reset"
-            raise RequestError(f"'{word}' is for a session: send its 'session_id', too")
+            raise RequestError(f"'{word}' is for a session: also send its 'session_id'")
         if episode.state is not None:
             return self._act_from_carried(store, request, episode)
         if stream is not None:
@@ -115,8 +115,8 @@ class Episodes:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
-                    f"the state does not say of which version of policy '{name}' it is, and that can be another than "
-                    f"{policy.contract.version} (loaded are {', '.join(store.versions(name))}): send back all that the "
+                    f"the state does not name its version of policy '{name}' it is, and that can be another than "
+                    f"{policy.contract.version} (loaded: {', '.join(store.versions(name))}): send back all that the "
                     f"last reply gave ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
                     "version in the address"
                 )
@@ -134,7 +134,7 @@ class Episodes:
         """Return which step of which episode of the recording this is."""
         if carried.is_empty:
             return EpisodeStep(new_episode_id(request.label), 0)
-        return carried.mark or EpisodeStep(new_episode_id(request.label), 1)  # nobody knows which, but not the first
+        return carried.mark or EpisodeStep(new_episode_id(request.label), 1)  # unknown which, but not the first
 
     def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
@@ -173,7 +173,7 @@ class Episodes:
     def _step_session(self, store: PolicyStore, request: Request, session: Session | None) -> tuple[Decision, Session]:
         """Return the decision and the session after it; the one before stays as it is.
 
-        A session answered its last request already when that is repeated; then it is the one after, too.
+        A session answered its last request already when that is repeated; then it is also the one after.
         """
         episode, seq = request.episode, request.seq
         assert episode is not None and episode.session_id is not None
@@ -216,7 +216,7 @@ def _choose(store: PolicyStore, request: Request) -> Policy:
 
 
 def _owner(store: PolicyStore, request: Request, identity: str) -> Policy:
-    """Return the policy that a carried state is of. Raises SessionError, or SessionLostError where it is gone."""
+    """Return the policy that a carried state is of. Raises SessionError, or SessionLostError if it is gone."""
     own = store.find(request.policy, identity)
     if own is None:
         store.get(request.policy, request.version)  # a policy or version that does not exist comes first
@@ -230,7 +230,7 @@ def _owner(store: PolicyStore, request: Request, identity: str) -> Policy:
 
 
 def _check_version(store: PolicyStore, request: Request, policy: Policy, memory: str) -> None:
-    """Raise SessionLostError where the policy of a memory is gone, SessionError where the request names another."""
+    """Raise SessionLostError if the policy of a memory is gone, SessionError if the request names another."""
     own = f"version {policy.contract.version} of policy '{request.policy}'"
     if not store.has(policy):
         raise SessionLostError(f"{memory} is of {own}, which is no longer loaded: begin an episode")

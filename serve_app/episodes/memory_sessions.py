@@ -43,7 +43,7 @@ class MemorySessions:
         return Counter(name for name, _ in self._sessions)
 
     def find(self, name: str, session_id: SessionId) -> Session | None:
-        """Return a session that is not idle, None where there is none."""
+        """Return a session that is not idle, None if there is none."""
         self._evict()
         return self._sessions.get((name, session_id))
 

@@ -3,7 +3,7 @@
 A key holds a stamp, new with every write, and the session. A step reads both, computes, and writes if the stamp is
 still the one that it read; otherwise another step was written first, and it starts again with what that one left. So
 the memories of a session form one chain, and an answer is sent only after its memory is part of it: however late a
-process goes on or a write arrives, no step is computed from an old memory.
+process continues or a write arrives, no step is computed from an old memory.
 
 A Redis that restarts or fails over may come back with an older copy. A session names the run of Redis (`run_id`) in
 which it was written, and is lost in every other.
@@ -75,7 +75,7 @@ class RedisSessions:
     async def act(
         self, store: PolicyStore, request: Request, session_id: SessionId, step_session: StepSession
     ) -> Decision:
-        """Decide for a request of a session, as `Sessions.act`. Raises DeadlineError, too."""
+        """Decide for a request of a session, as `Sessions.act`. Also raises DeadlineError."""
         named = json.dumps([request.policy, session_id]).encode()
         key = "rlservo:session:" + hashlib.blake2b(named, digest_size=16).hexdigest()
         stamp, run, session = await self._load(key, store, request, session_id)
@@ -92,7 +92,7 @@ class RedisSessions:
     async def _load(
         self, key: str, store: PolicyStore, request: Request, session_id: SessionId
     ) -> tuple[bytes, bytes, Session | None]:
-        """Return (stamp, Redis's run, session). Raises ClientGoneError, too."""
+        """Return (stamp, Redis's run, session). Also raises ClientGoneError."""
         record, run = await self._call(request, self._read, key)
         await check_client(request)  # after the read: what its client sent later is not in it, or it has hung up by now
         if record is None:
@@ -136,7 +136,7 @@ def _pack(session: Session, run: bytes) -> bytes:
 
 
 def _unpack(content: bytes, store: PolicyStore, name: str, session_id: SessionId, run: bytes) -> Session | None:
-    """Return a session; None where it was written in another run of Redis, or its policy is not loaded."""
+    """Return a session; None if it was written in another run of Redis, or its policy is not loaded."""
     fields = unpack(content)
     policy = store.find(name, fields.pop("identity"))
     if fields.pop("run") != run or policy is None:

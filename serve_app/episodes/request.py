@@ -21,7 +21,7 @@ LONGEST_LABEL = LONGEST_SESSION_ID  # a header may have 16 KB
 
 
 def new_episode_id(label: str | None) -> str:
-    """Return an id for an episode, or a stream, of whoever gave a label."""
+    """Return an id for an episode, or a stream, of a client with this label."""
     return secrets.token_hex(8) if label is None else f"{shorten_label(label)}.{secrets.token_hex(4)}"
 
 
@@ -35,7 +35,7 @@ def shorten_label(label: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """What a request says of the episode it belongs to. A client may send each of these fields, and no other."""
+    """Fields of a request about its episode. A client may send each of these fields, and no other."""
 
     state: Mapping[str, Any] | None = None
     """The recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: it
@@ -46,7 +46,7 @@ class Episode:
     end: bool = False  # forget the session after this request
     reward: Any = None
     final_status: str | None = None
-    """How the episode ended, in the client's word: the observation is the one after its last action."""
+    """End of the episode, in the client's word: the observation is the one after its last action."""
 
     truncated: bool = False  # whether it was broken off, as by a limit on its time
     last_action: Any = None  # what the robot was last commanded, where a limit is set on the step from it
@@ -76,11 +76,11 @@ class Request:
     arrived: float = field(default_factory=time.perf_counter)
     """When this process saw it, which `received` may be set back from."""
     connection: Any = None
-    """The address of the client's own connection, on which requests come in order; None where that is not known."""
+    """The address of the client's own connection, on which requests come in order; None if that is not known."""
     has_hung_up: Callable[[], Awaitable[bool]] | None = None
-    """Whether its client has gone, as far as is known; None where nobody could tell."""
+    """Whether its client has gone, as far as is known; None if it cannot be known."""
     label: str | None = None
-    """Whose request it is, in the client's words: where a canary runs, all of a label get the same version."""
+    """Whose request it is, in the client's words: when a canary runs, all of a label get the same version."""
     request_id: str | None = None
     headers: Mapping[bytes, bytes] = field(default_factory=dict)
     """Of an HTTP message, or the metadata of a gRPC call."""
@@ -89,7 +89,7 @@ class Request:
     stream: Session | None = None
     """The episode of the stream that it came on."""
     stream_id: str | None = None
-    """Of its WebSocket, whose requests share a request id and are told apart by `seq`."""
+    """Of its WebSocket, whose requests share a request id and are distinguished by `seq`."""
 
     obs: Any = None
     explore: bool = False
@@ -104,7 +104,7 @@ class Request:
     non_finite: bool = False
     """Whether its JSON held NaN or Infinity, which JSON does not have."""
     reply_options: Any = None
-    """How the reply is to be written: the codec's own affair, from its `parse` to its `encode`."""
+    """Form of the reply, from the codec's `parse` to its `encode`."""
 
 
 class ClientGoneError(Exception):
@@ -112,7 +112,7 @@ class ClientGoneError(Exception):
 
 
 async def check_client(request: Request) -> None:
-    """Raise ClientGoneError where a session's client gave its request up: its next episode may have begun."""
+    """Raise ClientGoneError if a session's client gave its request up: its next episode may have begun."""
     if request.has_hung_up is not None and await request.has_hung_up():
         raise ClientGoneError
 

@@ -29,7 +29,7 @@ class Session:
     connection: Any = None  # of the last request
     seq: int | None = None  # of the last request that was answered
     inputs_hash: bytes = b""  # of its observation
-    answer: Decision | None = None  # to the last request, for the same request sent again; None where it had no `seq`
+    answer: Decision | None = None  # to the last request, for the same request sent again; None if it had no `seq`
     is_ended: bool = False  # kept only for its answer
 
     def keep(self, step: Step) -> None:

@@ -1,7 +1,7 @@
 """Administration over HTTP: load, unload, alias, rollback, canary, shadow.
 
 A command answers when the change is proven, written into the repository's plan, and served by the process that took
-it; the other processes follow. `access_checks.authorize` lets nobody in without an admin key. The Open Inference
+it; the other processes follow. `access_checks.authorize` admits no one without an admin key. The Open Inference
 Protocol's `load` and `unload` are two of these under other names.
 """
 
@@ -67,7 +67,7 @@ def add_admin(app: FastAPI, handler: RequestHandler, control: PlanFollower) -> N
     for command, kind in COMMANDS.items():
         add_command(command, kind)
 
-    # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: nobody reads it.
+    # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: it is not read.
     def repository(path: str, summary: str) -> Callable[[Endpoint], Endpoint]:
         path, accepted = f"/v2/repository/models/{{name}}/{path}", [Depends(accept_media_type)]
         return post(path, TAG, summary, *STATUSES, response_class=Response, dependencies=accepted)

@@ -24,7 +24,7 @@ from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 
-DESCRIPTION = "Actions from exported RLlib policies. Every error is a sentence, a code and, where it helps, details."
+DESCRIPTION = "Actions from exported RLlib policies. Every error is a sentence, a code and, if it helps, details."
 
 
 def create_app(
@@ -58,10 +58,10 @@ def create_app(
         redoc_url=None,
         redirect_slashes=False,
     )
-    (document,) = app.routes  # FastAPI's own, /openapi.json: it tells nothing of policies
+    (document,) = app.routes  # FastAPI's own, /openapi.json: it reveals nothing of policies
     grant(Access.open)(document)
     add = app.router.routes.append
-    app.state.handler = handler  # for gRPC and the replica, which are no part of the application
+    app.state.handler = handler  # for gRPC and the replica, which are not part of the application
     json_routes.add_routes(app, handler, add)
     websocket_stream.add_routes(handler, add)
     _add_health(app, handler)

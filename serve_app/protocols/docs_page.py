@@ -43,7 +43,7 @@ SwaggerUIBundle({url: "openapi.json", dom_id: "#swagger-ui", deepLinking: true, 
 """
 SCRIPT_HASH = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
 HEADERS = {
-    # "Try it out" acts in the name of whoever clicks: no other page may put this one under its visitor's mouse.
+    # "Try it out" acts in the name of the visitor: no other page may put this one under its visitor's mouse.
     "Content-Security-Policy": (
         f"default-src 'none'; script-src 'self' 'sha256-{SCRIPT_HASH}'; style-src 'self' 'unsafe-inline'; "
         "img-src 'self' data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -56,7 +56,7 @@ PAGE = TEMPLATE % {"script": SCRIPT}
 
 
 class _Files(Mount):
-    """Swagger UI's own files, the same for everybody."""
+    """Swagger UI's own files, the same for every client."""
 
     access = Access.open
 

@@ -1,4 +1,4 @@
-"""Routes that FastAPI runs: nobody asks them a thousand times a second."""
+"""Routes that FastAPI runs: those that are seldom called."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 def add_route(
     app: FastAPI, access: Access, method: str, path: str, tag: str, summary: str, *statuses: int, **options: Any
 ) -> Callable[[Endpoint], Endpoint]:
-    """Return a decorator that adds a route: who may use it, and which errors it answers beside every route's."""
+    """Return a decorator that adds a route: who may use it, and which errors it answers besides every route's."""
     responses = error_models(*statuses)
 
     def add(endpoint: Endpoint) -> Endpoint:

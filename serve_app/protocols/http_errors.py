@@ -1,4 +1,4 @@
-"""HTTP status and body of each error, the same for every HTTP protocol; how a WebSocket is told of one."""
+"""HTTP status and body of each error, the same for every HTTP protocol; and a WebSocket's form of one."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ async def send_error(send: Send, error: RlservoError, *, kind: str = "http.respo
 async def refuse_upgrade(
     scope: Scope, receive: Receive, send: Send, error: RlservoError, headers: Headers = ()
 ) -> None:
-    """Answer an upgrade with an HTTP error; where the server cannot send one, accept it and fail in our own way."""
+    """Answer an upgrade with an HTTP error; if the server cannot send one, accept it and fail in our own way."""
     await receive()  # websocket.connect
     if DENIAL in scope.get("extensions", {}):
         await send_error(send, error, kind=DENIAL, headers=headers)
@@ -149,7 +149,7 @@ async def fail_stream(send: Send, content: bytes) -> None:
     try:
         await send({"type": "websocket.send", "text": content.decode()})
         await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
-    except (OSError, RuntimeError):  # the client has gone meanwhile: nobody is left to tell
+    except (OSError, RuntimeError):  # the client has gone meanwhile
         logger.debug("a stream's client went before its error could be sent")
 
 

@@ -147,7 +147,8 @@ def _check_fields(document: dict[str, Any]) -> None:
         shown = ", ".join(repr(name[:64]) for name in unknown)
         known = sorted(REQUEST_FIELDS)
         raise RequestError(
-            f"unknown field{'s' if len(unknown) > 1 else ''} {shown}: known are {', '.join(known)}", {"known": known}
+            f"unknown field{'s' if len(unknown) > 1 else ''} {shown}: expected one of {', '.join(known)}",
+            {"known": known},
         )
     if "obs" not in document:
         raise ObservationError(f"the request has no 'obs': send {SUCH_AS}")

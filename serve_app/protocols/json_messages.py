@@ -20,7 +20,7 @@ from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 LONGEST_LENIENT_BODY = 1 << 20  # a larger body with NaN in it is refused without saying where the NaN is
 OBS = (
-    "One observation or a batch (told apart by shape): nested lists as the observation space is shaped, or, where the "
+    "One observation or a batch (distinguished by shape): nested lists as the observation space is shaped, or, if the "
     "contract names the elements, a map from each name to a number (a batch: to a list of numbers). Dict spaces are "
     "maps, Tuple spaces lists of their parts."
 )
@@ -47,7 +47,7 @@ class ActRequest(BaseModel):
         None,
         description="A recurrent policy's memory, carried by you: {} begins an episode, then what the last reply gave, "
         "all of it: it names the version that it is of (`@policy`), and goes to no other. Where a policy's action is "
-        "limited in its step, it holds the last action, too.",
+        "limited in its step, it also holds the last action.",
     )
     session_id: str | None = Field(
         None,
@@ -73,7 +73,7 @@ class ActRequest(BaseModel):
         min_length=1,
         max_length=LONGEST_STATUS,
         description="How the episode ended, for a recording: `obs` is what followed its last action, and "
-        "the action of the reply is for nobody.",
+        "the action of the reply is not used.",
     )
     truncated: bool = Field(False, description="With `final_status`: the episode was broken off, as by a time limit.")
 
@@ -146,7 +146,7 @@ def _parse_lenient(body: bytes, error: orjson.JSONDecodeError, such_as: str) -> 
     """Parse NaN, Infinity and numbers too large for a double, which Python's own parser takes.
 
     A policy's client that sends them has a broken sensor or a division by zero; "invalid JSON" would not help it. What
-    else Python's parser takes (half a surrogate pair) is no JSON.
+    else Python's parser takes (half a surrogate pair) is not JSON.
     """
     non_finite = False
 

@@ -1,4 +1,4 @@
-"""Routes of the JSON protocol: actions under /v1/policies/NAME/act, and the listings beside them."""
+"""Routes of the JSON protocol: actions under /v1/policies/NAME/act, and the listings."""
 
 from __future__ import annotations
 

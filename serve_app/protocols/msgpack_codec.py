@@ -1,7 +1,7 @@
 """MessagePack as openpi's policy server speaks it: frame to `Request`, decision to a frame.
 
 A request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
-What openpi's clients send beside observations (`prompt`) is taken and ignored, unless it is an element's name.
+What openpi's clients send in addition to observations (`prompt`) is ignored, unless it is an element's name.
 `actions` in the reply is a chunk of one action, `(1, ...)`, as openpi's clients expect; a batch of observations gets
 one chunk each.
 """
@@ -25,7 +25,7 @@ from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 IGNORED = frozenset({"prompt", "env_id"})
-"""What openpi's clients send for policies that read a task, or act for several robots; without effect here."""
+"""Fields that openpi's clients send for other policies (task, robot); without effect here."""
 
 
 class MsgpackCodec:
@@ -63,7 +63,9 @@ class MsgpackCodec:
             if len(content) > 1:
                 unknown = next((str(key)[:64] for key in content if key not in REQUEST_FIELDS), None)
                 if unknown is not None:
-                    raise RequestError(f"unknown field '{unknown}': known are {', '.join(sorted(REQUEST_FIELDS))}")
+                    raise RequestError(
+                        f"unknown field '{unknown}': expected one of {', '.join(sorted(REQUEST_FIELDS))}"
+                    )
                 parse_options(request, content)
                 request.episode = parse_episode(content)
 

@@ -1,7 +1,7 @@
 """Model configuration and statistics, which Triton's tools ask for before they infer (perf_analyzer, model_analyzer).
 
 The documents have the fields of Triton's messages ModelConfig and ModelStatistics, over HTTP as JSON. A field of theirs
-that nothing here corresponds to is left out, a duration that nobody measures is 0.
+that nothing here corresponds to is left out, a duration that is not measured is 0.
 
 Specification: github.com/triton-inference-server/server, docs/protocol/extension_model_configuration.md and
 extension_statistics.md; github.com/triton-inference-server/common, protobuf/model_config.proto.
@@ -48,7 +48,7 @@ def model_config(handler: RequestHandler, name: str, version: str | None) -> dic
         "model_transaction_policy": {"decoupled": False},  # a request has one reply
     }
     if handler.store().batcher_of(policy) is not None:
-        # So many are run at once as soon as they are there, and nobody waits for others to come.
+        # So many are run at once as soon as they are there, without waiting for others.
         most = policy.options.micro_batch
         config["dynamic_batching"] = {"preferred_batch_size": [most], "max_queue_delay_microseconds": 0}
     elif policy.is_stateful:

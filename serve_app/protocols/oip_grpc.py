@@ -48,7 +48,7 @@ from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 Incoming = tuple[bytes, float | None]
-"""A request's bytes, and how many seconds its caller still waits for the answer (None: for ever)."""
+"""A request's bytes, and how many seconds its caller still waits for the answer (None: indefinitely)."""
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +113,7 @@ class Grpc:
             return messages.ServerLiveResponse()
 
     async def stream(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[Any]:
-        """Yield a reply to each request of a stream; an error is one, too, and the stream goes on, as Triton's does.
+        """Yield a reply to each request of a stream; an error is also a reply, and the stream continues.
 
         A stream that says nothing for `stream_idle_s` is ended.
         """
@@ -121,7 +121,7 @@ class Grpc:
         idle_s = handler.settings.stream_idle_s
         try:
             opening = self._begin("ModelStreamInfer", context)
-            opening.label = opening.label or secrets.token_hex(8)  # one version for all where a canary runs
+            opening.label = opening.label or secrets.token_hex(8)  # one version for all when a canary runs
             handler.open_stream(opening)
         except Exception as error:
             _fail(context, error)
@@ -304,7 +304,7 @@ def _set(parameter: Any, value: Any) -> None:
 
 
 def _inputs(message: Any) -> dict[str, NDArray[Any]]:
-    """Return the inputs by name. Raises RequestError where the form is wrong, ObservationError where numbers are."""
+    """Return the inputs by name. Raises RequestError if the form is wrong, ObservationError where numbers are."""
     raw = message.raw_input_contents
     if not message.inputs:
         raise RequestError("'inputs' must hold at least one tensor, with name, datatype and shape")

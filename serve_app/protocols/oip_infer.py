@@ -4,7 +4,7 @@ A policy is a model with the contract's inputs (`obs`, or `obs.<path>` for each 
 `state_in.<name>` and `reward`; `last_action` or `last_action.<path>`, where its step is limited) and outputs (`action`
 or `action.<path>`, `state_out.<name>`); every call is for a batch, as the protocol's shapes say. The request parameters
 `explore`, `seed`, `seq`, `deadline_ms` and `timestamp` mean what they mean in the JSON protocol; `sequence_id`,
-`sequence_start` and `sequence_end` are its sessions, and `state_policy`, which the reply gives beside the states, is
+`sequence_start` and `sequence_end` are its sessions, and `state_policy`, which the reply gives with the states, is
 its `@policy`.
 
 Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
@@ -56,7 +56,7 @@ LAST_ACTION = "last_action"  # inputs like the outputs `action` and `action.<pat
 STATE_POLICY = "state_policy"  # whose the states are
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
 MODEL_NAME = "model_name"  # KServe's client says again what the path says
-# What the protocol and its clients define beside our own options. A priority is read and has no effect: nothing queues.
+# Parameters of the protocol and its clients besides our own options. A priority has no effect: nothing queues.
 OUTCOME = ("reward", "final_status", "truncated")  # parameters with the meaning that they have in JSON
 PARAMETERS = frozenset(
     {*OPTIONS, *OUTCOME, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY}
@@ -87,7 +87,7 @@ class InferRequest(BaseModel):
     parameters: dict[str, Any] | None = Field(
         None,
         description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
-        "`sequence_end`, `state_policy` (which the reply gave beside the states), `binary_data_output`.",
+        "`sequence_end`, `state_policy` (which the reply gave with the states), `binary_data_output`.",
     )
     model_name: str | None = Field(None, description="The path's, if given at all.")
     inputs: list[Tensor]
@@ -108,7 +108,7 @@ class InferReply(BaseModel):
 
 @dataclass(slots=True)
 class ReplyOptions:
-    """How a request's reply is to be written."""
+    """Form of a request's reply."""
 
     contract: Contract
     binary: bool
@@ -128,7 +128,7 @@ class OipHttpCodec:
     async def receive(self, request: Request, source: Receive) -> Body:
         """Return the body, compressed as it came. Raises MediaTypeError, and what `receive_body` raises.
 
-        Triton's client names no content type, others name JSON or octets: the length header tells them apart.
+        Triton's client names no content type, others name JSON or octets: the length header distinguishes them.
         """
         check_media_type(request.headers, JSON, BINARY, optional=True)
         encoding = request.headers.get(b"content-encoding", b"")
@@ -254,7 +254,7 @@ def _parse_document(
         raise RequestError(f"'{MODEL_NAME}' is not '{model[:64]}', which the path names")
     unknown = next((field for field in document if field not in REQUEST_FIELDS), None)
     if unknown is not None:
-        raise RequestError(f"unknown field '{unknown[:64]}': known are {', '.join(sorted(REQUEST_FIELDS))}")
+        raise RequestError(f"unknown field '{unknown[:64]}': expected one of {', '.join(sorted(REQUEST_FIELDS))}")
     if document.get("id") is not None and type(document["id"]) is not str:
         raise RequestError(f"'id' must be a string, got {json_type(document['id'])}")
     if document.get("parameters") is not None and type(document["parameters"]) is not dict:
@@ -340,7 +340,7 @@ def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters:
     start, end = bool(parse_flag(parameters, "sequence_start")), bool(parse_flag(parameters, "sequence_end"))
     sequence_id = parameters.get("sequence_id")
     if sequence_id in (None, 0, ""):
-        if start and not states:  # a single step, for whoever carries from there what there is to carry
+        if start and not states:  # a single step, for a client that carries the state from there
             return Episode(state={}, **common)
         if not states and all(value is None or value is False for value in common.values()):
             return None
@@ -386,7 +386,7 @@ def _fill_options(request: Request, parameters: Mapping[str, Any]) -> None:
     for name in parameters:
         if name not in PARAMETERS and name not in IGNORED:
             raise RequestError(
-                f"unknown parameter '{name[:64]}': known are {', '.join(sorted(PARAMETERS | IGNORED))}",
+                f"unknown parameter '{name[:64]}': expected one of {', '.join(sorted(PARAMETERS | IGNORED))}",
                 {"known": sorted(PARAMETERS | IGNORED)},
             )
     transport_ms = request.deadline_ms

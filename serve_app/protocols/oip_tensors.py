@@ -38,7 +38,7 @@ TENSOR_FIELDS = frozenset({"name", "shape", "datatype", "parameters", "data"})
 
 
 def is_shape(shape: Sequence[Any]) -> bool:
-    """Whether numpy can make an array of this shape: an empty one, too, must not be too large in its other axes."""
+    """Whether numpy can make an array of this shape: even an empty one must not be too large in its other axes."""
     if len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
         return False
     return bool(math.prod(n for n in shape if n) < MOST_NUMBERS)
@@ -52,7 +52,7 @@ def datatype_of(dtype: str | np.dtype[Any]) -> str:
 def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDArray[Any], int]:
     """Return (name, array, offset after it); `offset` is where the tensor would begin in `raw`, were it binary.
 
-    Raises RequestError where the form is wrong, ObservationError where a number does not fit its datatype.
+    Raises RequestError if the form is wrong, ObservationError if a number does not fit its datatype.
     """
     if type(document) is not dict:
         raise RequestError(f"every entry of 'inputs' must be an object, got {json_type(document)}")
@@ -63,7 +63,7 @@ def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDAr
     label = name[:64]
     unknown = next((field for field in document if field not in TENSOR_FIELDS), None)
     if unknown is not None:
-        raise RequestError(f"input '{label}' has the unknown field '{unknown[:64]}': known are name, shape, ...")
+        raise RequestError(f"input '{label}' has the unknown field '{unknown[:64]}': expected name, shape, ...")
     parameters = document.get("parameters") or {}
     if type(parameters) is not dict:
         raise RequestError(f"input '{label}': 'parameters' must be an object, got {json_type(parameters)}")
@@ -151,7 +151,7 @@ def _leaf_types(data: list[Any]) -> set[type]:
 
 
 def as_datatype(label: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return an input's numbers in its datatype. Raises ObservationError where that has no such number."""
+    """Return an input's numbers in its datatype. Raises ObservationError if that has no such number."""
     unfit = find_unfit(array, dtype) if dtype.kind in "iub" else None
     if unfit is not None:
         raise ObservationError(f"input '{label}': {array[unfit[0]].flat[0]} is {unfit[1]}")

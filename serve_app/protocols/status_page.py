@@ -1,7 +1,7 @@
 """Web page at `/` that shows what runs, for browsers alone: a program gets there what it gets where nothing is.
 
-The page is static: whoever opens the address may have it, without a key. What it shows it asks of `/v1/policies` and
-`/metrics`, with the key that its user types where the server wants one, from where it stays in a variable.
+The page is static: anyone may open it, without a key. What it shows it asks of `/v1/policies` and
+`/metrics`, with the key that its user types if the server wants one, from where it stays in a variable.
 
 Sources: RFC 9110, section 12.5.1 (Accept); Content Security Policy Level 3; Trusted Types (W3C).
 """
@@ -70,7 +70,7 @@ def add_status_page(app: FastAPI) -> None:
 
 
 class _FileRoute(Route):
-    """The page's script, style and icon, the same for everybody."""
+    """The page's script, style and icon, the same for every client."""
 
     access = Access.open
 

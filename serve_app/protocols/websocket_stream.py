@@ -2,7 +2,7 @@
 
 On connecting the server sends one msgpack map, the metadata; then request and response alternate as binary frames
 (`msgpack_codec.py`). An error is a text frame with the JSON protocol's error body, then close 1011; a client that
-connects with `?errors=keep` gets the text frame alone, with the request's `seq`, and goes on.
+connects with `?errors=keep` gets the text frame alone, with the request's `seq`, and continues.
 
 The recurrent state is the connection's: at its start when the connection opens and after `reset`, gone with the
 connection. A client that would rather carry it sends `state`, as over JSON.
@@ -85,7 +85,7 @@ class StreamEndpoint:
         try:
             opening.policy, opening.version = self._address(scope["path_params"])
             opening.stream_id = new_episode_id(opening.label)
-            opening.label = opening.label or opening.stream_id  # where a canary runs they all get the same version
+            opening.label = opening.label or opening.stream_id  # when a canary runs they all get the same version
             policy = handler.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
             handler.record_failure(opening, error.code, error.message)
@@ -117,7 +117,7 @@ class StreamEndpoint:
             await _close_idle(send)
         except RlservoError as error:
             await fail_stream(send, error_answer(error)[1])
-        except OSError:  # the client went while its reply was being sent: nobody is left to tell
+        except OSError:  # the client went while its reply was being sent
             logger.debug("a stream's client went before its reply could be sent")
         except Exception:
             handler.record_bug(opening)
@@ -156,7 +156,7 @@ class _Conversation:
         self._is_fresh = False
 
     async def answer(self, message: Message) -> Message:
-        """Return the reply. Raises RlservoError, which has been recorded, where it ends the stream."""
+        """Return the reply. Raises RlservoError, which has been recorded, if it ends the stream."""
         handler, opening = self._handler, self._opening
         request = Request(
             PROTOCOL,

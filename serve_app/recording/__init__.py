@@ -1,1 +1,1 @@
-"""Flight recorder: decisions of policies written to MCAP files beside the loop, read back, shown and converted."""
+"""Flight recorder: decisions of policies written to MCAP files alongside the loop, read back, shown and converted."""

@@ -54,7 +54,7 @@ def _remove(path: Path) -> None:
 def episodes_of_one(recording: Recording, name: str | None) -> Iterator[Episode]:
     """Yield the episodes of one policy: `name`, or the only one.
 
-    Raises UsageError where the recording has several, or versions whose observations or actions differ.
+    Raises UsageError if the recording has several, or versions whose observations or actions differ.
     """
     chosen: Episode | None = None
     for episode in episodes(recording):

@@ -56,7 +56,7 @@ class Episode:
 
     @property
     def gap(self) -> int | None:
-        """Return the first row before which decisions are missing; None where there are all."""
+        """Return the first row before which decisions are missing; None if there are all."""
         expected = self.steps[0] + np.arange(len(self)) if self.id else self.steps
         if self.id and not self.begins and self.steps[0] == 0:
             return 0
@@ -80,7 +80,7 @@ class Episode:
 
     @cached_property
     def action(self) -> Columns:
-        """The actions that were sent, by tensor name; zeros where there was none (`acted`)."""
+        """The actions that were sent, by tensor name; zeros if there was none (`acted`)."""
         return self.policy.actions.columns([one.get("action") for one in self._decisions])
 
     @cached_property
@@ -116,12 +116,12 @@ class Episode:
 
     @cached_property
     def logp(self) -> NDArray[np.float64]:
-        """The log-probability of each own action; not a number where it is not known."""
+        """The log-probability of each own action; NaN if it is not known."""
         return self._numbers("logp")
 
     @cached_property
     def dist_inputs(self) -> NDArray[np.float32]:
-        """The distribution's parameters `[rows, n]`; not a number where they are not known."""
+        """The distribution's parameters `[rows, n]`; NaN if they are not known."""
         size = next((len(one["dist_inputs"]) for one in self._decisions if "dist_inputs" in one), 0)
         unknown = [math.nan] * size
         rows = [one.get("dist_inputs", unknown) for one in self._decisions]
@@ -129,18 +129,18 @@ class Episode:
 
     @cached_property
     def reward(self) -> NDArray[np.float64]:
-        """What each decision brought; not a number where it is not known."""
+        """Reward of each decision; NaN if it is not known."""
         rewards = [math.nan if one is None else one.get("reward", math.nan) for one in self._outcomes]
         return np.array(rewards, np.float64)  # a null is not a number
 
     @cached_property
     def reward_input(self) -> NDArray[np.float64]:
-        """The reward that the policy was given to see; not a number where it was given none."""
+        """The reward that the policy was given to see; NaN if it was given none."""
         return self._numbers("reward_input")
 
     @cached_property
     def last_action_input(self) -> dict[int, Columns]:
-        """By row the action `[1, *shape]` that a limit on the step counted from, where the client gave it."""
+        """By row the action `[1, *shape]` that a limit on the step counted from, if the client gave it."""
         key = "last_action_input"
         given = [(row, one[key]) for row, one in enumerate(self._decisions) if key in one]
         return {row: self.policy.actions.columns([action]) for row, action in given}
@@ -169,11 +169,11 @@ class Episode:
 
     @property
     def errors(self) -> list[str | None]:
-        """Return for each row why there was no action; None where there was."""
+        """Return for each row why there was no action; None if there was."""
         return [one.get("error") for one in self._decisions]
 
     def field(self, name: str) -> list[Any]:
-        """Return a field as it was recorded, such as `seq` or `request_id`; None where it is absent."""
+        """Return a field as it was recorded, such as `seq` or `request_id`; None if it is absent."""
         return [one.get(name) for one in self._decisions]
 
     def _drop_last(self) -> None:
@@ -232,7 +232,7 @@ def _add_decision(
 
 
 def _add_outcome(episode: Episode, fields: dict[str, Any]) -> None:
-    """Put what came of a decision beside it: nearly always the last one."""
+    """Attach an outcome to its decision: nearly always the last one."""
     for row in range(len(episode) - 1, -1, -1):
         if episode._decisions[row]["step"] == fields["step"]:
             episode._outcomes[row] = {**(episode._outcomes[row] or {}), **fields}

@@ -43,7 +43,7 @@ def export_lerobot(
     """Write the new folder `out` and return (episodes, frames).
 
     Observations are `observation.state`, what the robot was commanded is `action`. Episodes with a gap, or with a step
-    without an action, are left out. Raises UsageError where nothing is left, and RecordingError.
+    without an action, are left out. Raises UsageError if nothing is left, and RecordingError.
     """
     pa = optional_package("pyarrow", "an export to LeRobot")
     pq = optional_package("pyarrow.parquet", "an export to LeRobot")

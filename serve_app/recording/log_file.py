@@ -1,6 +1,6 @@
 """One MCAP file being written: channels, JSON messages, a chunk each flush.
 
-A file is readable to its last flush, whatever becomes of its writer. Times are two: a message's log time goes on with
+A file is readable to its last flush, whatever becomes of its writer. Times are two: a message's log time continues with
 the monotonic clock from the file's start, so that plots never run backwards, and its publish time is the wall clock's.
 """
 
@@ -40,7 +40,7 @@ class LogFile:
     """An MCAP file that this process writes and holds a lock on: others may read it, and do not delete it."""
 
     def __init__(self, path: Path) -> None:
-        """Create `path`, readable by its owner alone. Raises OSError, FileExistsError where it exists."""
+        """Create `path`, readable by its owner alone. Raises OSError, FileExistsError if it exists."""
         self.path = path
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         fcntl.flock(descriptor, fcntl.LOCK_EX)  # ends with the process, however that ends
@@ -69,7 +69,7 @@ class LogFile:
 
     @property
     def is_deleted(self) -> bool:
-        """Whether nobody can open it any more: what is written is lost."""
+        """Whether it can no longer be opened: what is written is lost."""
         return os.fstat(self._stream.fileno()).st_nlink == 0
 
     @property
@@ -77,7 +77,7 @@ class LogFile:
         return (time.monotonic_ns() - self._monotonic_ns) / 1e9
 
     def add_decision(self, record: DecisionRecord) -> None:
-        """Write a decision, of a batch one for each row. Raises ValueError or RequestError where it does not fit."""
+        """Write a decision, of a batch one for each row. Raises ValueError or RequestError if it does not fit."""
         policy, own, inputs = record.policy, record.own_action, record.dist_inputs
         columns = [_member("obs", policy.observations.encode_rows(record.obs))]
         for name, action in (
@@ -98,7 +98,7 @@ class LogFile:
         self._add_rows("decision", record, columns, _details(record))
 
     def add_outcome(self, record: OutcomeRecord) -> None:
-        """Write what came of a decision. Raises ValueError or RequestError where it does not fit."""
+        """Write what came of a decision. Raises ValueError or RequestError if it does not fit."""
         policy, columns = record.policy, []
         if record.reward is not None:
             columns.append(_rewards("reward", record.reward, record.rows))

@@ -27,9 +27,9 @@ def export_minari(recording: Recording, out: str | Path, *, name: str | None = N
     """Write a dataset into the new folder `out` and return (its id, episodes, the id of its environment).
 
     `MINARI_DATASETS_PATH=out`, an absolute path, lets minari load it by that id. The environment, which minari's
-    `recover_environment` makes, is the one that the policy was trained in, None where this Python does not have it with
+    `recover_environment` makes, is the one that the policy was trained in, None if this Python does not have it with
     the policy's observations and actions. Minari's episodes need every reward, an end and the
-    observation after the last action: others are left out. Raises UsageError where nothing is left, and RecordingError.
+    observation after the last action: others are left out. Raises UsageError if nothing is left, and RecordingError.
     """
     minari = optional_package("minari", "an export to Minari")
     collector = optional_package("minari.data_collector", "an export to Minari")

@@ -1,6 +1,6 @@
 """A module's own actions in a recorded episode: what RLlib's learners learn from.
 
-A record has the own action where it explored. Where it has none, or the robot did something else (a fallback, a step
+A record has the own action if it explored. Where it has none, or the robot did something else (a fallback, a step
 limit), the executed action is taken back through unsquash and clip.
 """
 
@@ -29,7 +29,7 @@ class OwnActions:
     known: NDArray[np.bool_]
     """Rows whose own action is known; the others hold some number."""
     recorded: NDArray[np.bool_]
-    """Rows whose own action, or its distribution, was recorded; those that are known beside them are computed."""
+    """Rows whose own action, or its distribution, was recorded; the others that are known are computed."""
     clipped: NDArray[np.bool_]
     """Rows whose own action is computed and lies at the bound or anywhere beyond it: the bound stands for it."""
 

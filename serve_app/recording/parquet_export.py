@@ -1,4 +1,4 @@
-"""A recording as one Parquet file: a row a decision, a list column a tensor, what came of it beside it."""
+"""A recording as one Parquet file: a row a decision, a list column per tensor, with its outcome."""
 
 from __future__ import annotations
 

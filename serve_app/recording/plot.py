@@ -20,7 +20,7 @@ MOST_CURVES = 64
 def plot_episode(recording: Recording, number: int, out: str | Path) -> Episode:
     """Draw episode `number` (from 0, in the order they ended) into the file `out` and return it.
 
-    Raises UsageError where there is no such episode, or matplotlib is missing.
+    Raises UsageError if there is no such episode, or matplotlib is missing.
     """
     figures = optional_package("matplotlib.figure", "a plot")
     episode = next(islice(episodes(recording), number, None), None)

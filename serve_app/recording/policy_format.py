@@ -29,7 +29,7 @@ class LeafArrays(dict[str, NDArray[Any]]):
 
 
 class PolicyFormat:
-    """How one policy's decisions are written and read; one object per policy, version and graph."""
+    """Format of one policy's decisions; one object per policy, version and graph."""
 
     def __init__(self, contract: Contract, *, graph_hash: str = "", options: Mapping[str, Any] | None = None) -> None:
         """`graph_hash` is empty where only a server knows it; `options` are those of `PolicyOptions` that were set."""
@@ -47,7 +47,7 @@ class PolicyFormat:
 
     @property
     def key(self) -> tuple[str, str, str, str, str]:
-        """What makes two recorded policies the same one."""
+        """Identity of a recorded policy."""
         options = json.dumps(self.options, sort_keys=True)
         return self.contract.name, self.contract.version, self.graph_hash, self.contract_hash, options
 
@@ -60,7 +60,7 @@ class PolicyFormat:
         )
 
     def log_probability(self, inputs: NDArray[Any], own: Leaves) -> NDArray[np.float64] | None:
-        """Return the log-probability of each row's own action; None where the policy has no distribution."""
+        """Return the log-probability of each row's own action; None if the policy has no distribution."""
         if self.contract.distribution is None:
             return None
         return log_probability(inputs, own, self.contract.distribution, self.contract.action_space)
@@ -80,7 +80,7 @@ class SpaceFormat:
     def arrays(self, value: Any) -> LeafArrays:
         """Return one value, or a batch, as `[rows, *shape]` in the space's own types.
 
-        Raises ValueError or RequestError where the value is not of the space.
+        Raises ValueError or RequestError if the value is not of the space.
         """
         parts = value if isinstance(value, LeafArrays) else self._parts(value)
         return LeafArrays({name: self._formats[name].array(parts[name]) for name in self.leaves})
@@ -235,17 +235,20 @@ def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
     return _object(
         f"Decision of {policy.title}",
         {
-            "episode": _text("Session, stream or loop; absent where nothing tells"),
+            "episode": _text("Session, stream or loop; absent if unknown"),
             "step": _integer("Which decision of the episode, from 0"),
             "obs": policy.observations.schema(),
-            "action": {**action, "description": "As sent; absent where there was none"},
+            "action": {**action, "description": "As sent; absent if there was none"},
             "commanded": {**action, "description": "What the robot was commanded instead of an action"},
             "own_action": {**action, "description": "The module's own action, before unsquash, clip and start"},
             "dist_inputs": {"type": "array", "items": {"type": "number"}, "description": "null: minus infinity"},
             "logp": {"type": "number", "description": "Log-probability of own_action"},
             "explore": {"type": "boolean"},
             "reward_input": {"type": "number", "description": "The reward that the policy was given to see"},
-            "last_action_input": {**action, "description": "What a limit on the step counted from, if the client told"},
+            "last_action_input": {
+                **action,
+                "description": "What a limit on the step counted from, if the client sent it",
+            },
             "latency_ms": {"type": "number", "description": "[ms]", "unit": "ms"},
             "seq": _integer("The request's number"),
             "request_id": _text("The request's id in the server's log"),

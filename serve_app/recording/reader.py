@@ -24,7 +24,7 @@ from rlservo.serve_app.recording.log_file import DROPPED_TOPIC
 from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.recording.recorder import SUFFIX, is_being_written
 
-LARGEST_RECORD = 512 * 1024 * 1024  # beyond it a length is no length, but damage
+LARGEST_RECORD = 512 * 1024 * 1024  # a larger length is damage
 CLOCK_JUMP_NS = 1_000_000_000
 
 
@@ -47,7 +47,7 @@ class Entry:
 
 @dataclass
 class FileFacts:
-    """What reading one file came to."""
+    """Result of reading one file."""
 
     path: Path
     metadata: dict[str, str] = field(default_factory=dict)
@@ -55,18 +55,18 @@ class FileFacts:
     """Whether the file has its end; else it was read to its last whole chunk."""
     being_written: bool = False
     damage: str | None = None
-    """What is wrong with it beyond a missing end."""
+    """Damage beyond a missing end."""
     messages: int = 0
     dropped: int = 0
     clock_jumps: int = 0
-    """How often the wall clock moved by more than a second against the monotonic clock."""
+    """Number of times that the wall clock moved by more than a second against the monotonic clock."""
 
 
 class Recording:
     """The recordings in some files and folders, read one after the other."""
 
     def __init__(self, paths: Sequence[str | Path] | str | Path) -> None:
-        """Raise RecordingError where there is no file."""
+        """Raise RecordingError if there is no file."""
         given = [paths] if isinstance(paths, str | Path) else list(paths)
         self.paths: list[Path] = []
         for path in map(Path, given):
@@ -76,7 +76,7 @@ class Recording:
             self.paths += inside
         missing = next((path for path in self.paths if not path.is_file()), None)
         if missing is not None:
-            raise RecordingError(f"{missing} does not exist, or is no file")
+            raise RecordingError(f"{missing} does not exist, or is not a file")
         self.files: list[FileFacts] = []
         """Of the files that were read so far."""
         self.policies: list[PolicyFormat] = []
@@ -85,7 +85,7 @@ class Recording:
     def entries(self) -> Iterator[Entry]:
         """Yield every decision and outcome, in the order they were written.
 
-        Raises RecordingError where a file is no MCAP file, or another program's.
+        Raises RecordingError if a file is not an MCAP file, or another program's.
         """
         self.files = []
         for path in self.paths:
@@ -105,7 +105,7 @@ class Recording:
 def read_records(facts: FileFacts) -> Iterator[McapRecord]:
     """Yield what is in the file `facts.path`, chunks taken apart, to its last whole chunk.
 
-    Sets `whole` and `damage` at the end. Raises RecordingError where it is no MCAP file.
+    Sets `whole` and `damage` at the end. Raises RecordingError if it is not an MCAP file.
     """
     path = facts.path
 
@@ -124,10 +124,10 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
             facts.whole = True  # the footer and the closing magic were there
         except InvalidMagic:
             if stream.tell() <= len(b"\x89MCAP0\r\n"):
-                raise RecordingError(f"{path} is no MCAP file") from None
+                raise RecordingError(f"{path} is not an MCAP file") from None
         except (EndOfFile, struct.error) as error:  # in the middle of a record
             if stream.tell() < len(b"\x89MCAP0\r\n"):
-                raise RecordingError(f"{path} is no MCAP file, or empty") from error
+                raise RecordingError(f"{path} is not an MCAP file, or empty") from error
         except (McapError, CRCValidationError, ValueError, MemoryError, OverflowError) as error:
             damaged(error)
         except Exception as error:  # zstandard's and lz4's own errors share no base

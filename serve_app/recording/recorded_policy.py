@@ -60,7 +60,7 @@ class WithRecording(ActingPolicy):
 
     @property
     def policy(self) -> ActingPolicy:
-        """What is recorded."""
+        """The recorded policy."""
         return self._policy
 
     @property
@@ -69,7 +69,7 @@ class WithRecording(ActingPolicy):
 
     @property
     def recorder(self) -> Recorder:
-        """Where the records go."""
+        """Recorder of the decisions."""
         assert self._recorder is not None
         return self._recorder
 
@@ -130,7 +130,7 @@ class WithRecording(ActingPolicy):
         final_status: str | None,
         final_obs: Observation | None,
     ) -> None:
-        """Record what the last action brought, and tell nobody."""
+        """Record what the last action brought, without passing it on."""
         self._add_outcome(
             reward=None if reward is None else float(reward),
             terminated=bool(terminated),
@@ -147,7 +147,7 @@ class WithRecording(ActingPolicy):
             pass_on(action)
 
     def record_command(self, action: Any) -> None:
-        """Record what the robot was commanded instead of the last action, and tell nobody."""
+        """Record what the robot was commanded instead of the last action, without passing it on."""
         self._add_outcome(commanded=_copy(action))
 
     def begin(self) -> None:
@@ -155,7 +155,7 @@ class WithRecording(ActingPolicy):
         self._episode, self._step = uuid.uuid4().hex[:16], 0
 
     def end(self) -> None:
-        """End the recording, and nothing else; a Recorder that was given goes on."""
+        """End the recording, and nothing else; a Recorder that was given continues."""
         if self._own is not None:
             self._own.close()
 
@@ -170,7 +170,7 @@ class WithRecording(ActingPolicy):
         self._policy.close()
 
     def _known_format(self, has_acted: bool) -> PolicyFormat | None:
-        """Return the policy's format; None before a server has told its contract."""
+        """Return the policy's format; None before a server has sent its contract."""
         if has_acted and (self._format is None or self._policy.contract is not self._format_contract):
             self._format_contract = self._policy.contract  # of a client's, another version may answer by now
             options = getattr(self._source, "options", None)

@@ -63,8 +63,8 @@ class Recorder(Closeable):
         """Record to the new file `path` where that ends in .mcap, else into the folder `path`.
 
         A folder's file is ended at `max_file_bytes` or after `max_file_s`; of a folder beyond `max_folder_bytes` the
-        oldest recordings that nobody is writing are deleted. `wait` lets a full buffer hold the caller up instead of
-        dropping: for a simulation, which has the time. Raises UsageError where nothing can be written there.
+        oldest recordings that are not being written are deleted. With `wait` a full buffer blocks the caller instead of
+        dropping: for a simulation, which has the time. Raises UsageError if nothing can be written there.
         """
         if max_file_bytes < MIB or max_file_s <= 0 or max_folder_bytes < 2 * max_file_bytes:
             raise UsageError(
@@ -84,7 +84,7 @@ class Recorder(Closeable):
         """Records that did not fit into the buffer, or came after recording had ended."""
         self.written = 0
         self.failure: str | None = None
-        """Why recording has ended, where it could not go on."""
+        """Why recording has ended, if it could not continue."""
         self._marked = 0
         self._unreadable = False
         self._files = 0
@@ -150,7 +150,7 @@ class Recorder(Closeable):
                     break
             if self._file is not None:
                 self._file.close()
-        except Exception as error:  # a full disk, a folder that went away: acting goes on
+        except Exception as error:  # a full disk, a folder that went away: acting continues
             self._end(error)
 
     def _drain(self) -> None:
@@ -210,7 +210,7 @@ class Recorder(Closeable):
             self._buffer.clear()
         if self._file is not None:
             self._file.abandon()
-        logger.error("recording to %s has ended, acting goes on: %s", self.path, self.failure)
+        logger.error("recording to %s stopped, acting continues: %s", self.path, self.failure)
 
 
 def _delete_oldest(folder: Path, limit: int) -> None:

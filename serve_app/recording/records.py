@@ -25,37 +25,37 @@ class DecisionRecord:
     obs: Observation | LeafArrays
     """As the policy was given it; a batch is recorded as so many decisions."""
     action: Any
-    """As it was sent, in the action space's own form; None where there was none."""
+    """As it was sent, in the action space's own form; None if there was none."""
     episode: str = ""
-    """Session, stream or loop; empty where nothing tells. Row i of a batch is episode `<episode>.<i>`."""
+    """Session, stream or loop; empty if unknown. Row i of a batch is episode `<episode>.<i>`."""
     step: int = 0
     """Which decision of the episode, from 0."""
     latency_ms: float | None = None
     explore: bool = False
     own_action: Mapping[str, NDArray[Any]] | None = None
-    """Where it explored: the module's own action by tensor name `[batch, *shape]` (`Draw.own`)."""
+    """If it explored, the module's own action by tensor name `[batch, *shape]` (`Draw.own`)."""
     dist_inputs: NDArray[Any] | None = None
-    """Where it explored: `action_dist_inputs`, `[batch, n]`."""
+    """If it explored, `action_dist_inputs`, `[batch, n]`."""
     reward_input: Any = None
     """The reward that the policy was given to see."""
     last_action_input: Any = None
-    """The action that a limit on the step counted from, where the client gave it."""
+    """The action that a limit on the step counted from, if the client gave it."""
     seq: int | None = None
     request_id: str | None = None
     warnings: Sequence[str] = ()
     error: str | None = None
     """The code of what came instead of an action: deadline-passed, unavailable, bad-observation ..."""
     commanded: Any = None
-    """What the robot was commanded instead, in the action space's own form."""
+    """Command to the robot instead, in the action space's own form."""
     rows: int = 1
-    """How many decisions it is."""
+    """Number of decisions it is."""
     wall_ns: int = field(default_factory=time.time_ns)
     monotonic_ns: int = field(default_factory=time.monotonic_ns)
 
 
 @dataclass(slots=True, eq=False)
 class OutcomeRecord:
-    """What came of a decision: known to the control loop, and later than the action."""
+    """Outcome of a decision, which the control loop knows later than the action."""
 
     policy: PolicyFormat
     episode: str
@@ -68,9 +68,9 @@ class OutcomeRecord:
     final_obs: Observation | LeafArrays | None = None
     """The observation after an episode's last action, which no decision holds."""
     commanded: Any = None
-    """What the robot was commanded instead of the action."""
+    """Command to the robot instead of the action."""
     robot: Mapping[str, Any] | None = None
-    """Of a real robot: its state, its changes, and the limits that were kept."""
+    """State of a real robot, its changes, and the limits that were kept."""
     rows: int = 1
     """Of the decision."""
     wall_ns: int = field(default_factory=time.time_ns)

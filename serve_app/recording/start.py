@@ -21,7 +21,7 @@ def record_policy(
     wait: bool = False,
     act: Callable[..., Any] | None = None,
 ) -> WithRecording:
-    """Return `WithRecording(policy, record)`; raise UsageError where a package is missing."""
+    """Return `WithRecording(policy, record)`; raise UsageError if a package is missing."""
     with needs_extra("record", what="recording"):
         from rlservo.serve_app.recording.recorded_policy import WithRecording
 

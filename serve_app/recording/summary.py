@@ -43,7 +43,7 @@ class PolicySummary:
 
 @dataclass
 class Summary:
-    """What is in a recording."""
+    """Content of a recording."""
 
     files: list[dict[str, Any]]
     policies: list[PolicySummary]

@@ -38,7 +38,7 @@ class Estimate:
     value: float
     interval: tuple[float, float]
     effective_samples: float
-    """Episodes of the bundle's own that would tell as much."""
+    """Number of the bundle's own episodes with as much information."""
     supported: bool
     reason: str
     """A sentence: why the interval holds, or why the recordings cannot support it."""
@@ -46,7 +46,7 @@ class Estimate:
 
 @dataclass
 class EstimateReport:
-    """What the recordings say of a bundle's return."""
+    """Estimate of a bundle's return from recordings."""
 
     bundle: str
     target: str
@@ -68,11 +68,11 @@ class EstimateReport:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What an estimate needs of one episode."""
+    """One episode, as an estimate needs it."""
 
     rewards: NDArray[np.float64]
     log_weights: NDArray[np.float64] | None
-    """Log of how much likelier each action is under the bundle; None where that is not known."""
+    """Log of how much likelier each action is under the bundle; None if that is not known."""
     obs: NDArray[np.float32]
     """`[steps, n]`"""
     actions: NDArray[np.float32]
@@ -93,8 +93,8 @@ def estimate(
 ) -> EstimateReport:
     """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploring one.
 
-    `progress` gets what is being done. Raises OtherContractError where the recording does not fit the bundle, and
-    UsageError where no episode can be used.
+    `progress` gets what is being done. Raises OtherContractError if the recording does not fit the bundle, and
+    UsageError if no episode can be used.
     """
     if not 0 < gamma <= 1:
         raise UsageError(f"gamma must be above 0 and at most 1, got {gamma:g}")
@@ -198,12 +198,12 @@ def _support(episodes: int, effective: float) -> tuple[bool, str]:
         return False, f"{episodes} episodes are too few: at least {FEWEST_EPISODES} are needed"
     if effective < SMALLEST_SHARE * episodes:
         return False, (
-            f"the bundle acts too differently from what was recorded: {episodes} episodes tell as much as "
+            f"the bundle acts too differently from what was recorded: {episodes} episodes are worth as much as "
             f"{effective:.1f} of its own, and {SMALLEST_SHARE * episodes:.0f} are needed"
         )
     return True, (
-        f"{episodes} episodes tell as much as {effective:.0f} of the bundle's own; what happens in fewer than one of "
-        f"{max(1, episodes // 3)} may be missing"
+        f"{episodes} episodes are worth as much as {effective:.0f} of the bundle's own; what happens in fewer than one "
+        f"of {max(1, episodes // 3)} may be missing"
     )
 
 

@@ -1,7 +1,7 @@
 """Recorded episodes followed by another policy: what it would have done, decision by decision.
 
 A policy that remembers nothing computes an episode's observations at once. A batch's sums may be formed in another
-order, so that last bits differ: where the action is not the recorded one and close to it, the observation is computed
+order, so that last bits differ: if the action is not the recorded one and close to it, the observation is computed
 again by itself, as it was when the robot was driven. Recurrent state and step limits start where the episode did.
 """
 
@@ -41,7 +41,7 @@ class FollowedEpisode:
 
     episode: Episode
     known: NDArray[np.bool_]
-    """Whether the bundle's action is known: not without a recorded one, nor after a gap where the policy remembers."""
+    """Whether the bundle's action is known: not without a recorded one, nor after a gap if the policy remembers."""
     unsafe: NDArray[np.bool_]
     """Whether the bundle's action was none of its space."""
     action: dict[str, NDArray[Any]]
@@ -60,7 +60,7 @@ class Follower:
         self._checked: set[int] = set()
         self._carried: dict[tuple[int, str], tuple[State | None, dict[str, NDArray[Any]] | None]] = {}
         self.skipped: dict[str, int] = {}
-        """How many decisions are of other policies, by their name."""
+        """Number of decisions of other policies, by name."""
 
     @property
     def contract(self) -> Contract:
@@ -159,7 +159,7 @@ class Follower:
 
 
 def _follow_at_once(policy: Policy, episode: Episode) -> FollowedEpisode | None:
-    """Follow an episode with a policy that remembers nothing; None where a row needs a look of its own."""
+    """Follow an episode with a policy that remembers nothing; None if a row needs a look of its own."""
     known = np.flatnonzero(episode.acted)
     action = {name: np.zeros_like(leaf) for name, leaf in episode.action.items()}
     inputs: NDArray[Any] | None = None

@@ -20,7 +20,7 @@ WORST_MOMENTS = 10
 
 @dataclass
 class ElementDifference:
-    """How one element of the action differs, over all decisions that were compared."""
+    """Differences of one action element, over all decisions that were compared."""
 
     name: str
     unit: str
@@ -33,7 +33,7 @@ class ElementDifference:
 
 @dataclass(frozen=True)
 class Moment:
-    """One of the largest differences. They are ranked in parts of the element's range, where it has one."""
+    """One of the largest differences. They are ranked in parts of the element's range, if it has one."""
 
     time_s: float
     episode: str
@@ -45,19 +45,19 @@ class Moment:
 
 @dataclass
 class ReplayReport:
-    """What a replay found."""
+    """Result of a replay."""
 
     bundle: str
     policies: list[str] = field(default_factory=list)
     """The recorded policies, `name/version`."""
     same_graph: bool | None = None
-    """Whether the recorded graph is the bundle's; None where a recording does not know it."""
+    """Whether the recorded graph is the bundle's; None if a recording does not know it."""
     tolerance: float = 0.0
     episodes: int = 0
     decisions: int = 0
     compared: int = 0
     identical: int = 0
-    """Decisions whose action (where it explored, whose distribution) is the same bit for bit."""
+    """Decisions whose action (if it explored, whose distribution) is the same bit for bit."""
     changed: int = 0
     """Decisions with an element beyond the tolerance."""
     explored: int = 0
@@ -90,8 +90,8 @@ def replay(
 ) -> ReplayReport:
     """Put every recorded episode through a bundle and return the differences.
 
-    `name` picks a recorded policy where there are several; by default the one of the bundle's name. Raises
-    OtherContractError where the recording does not fit the bundle, and UsageError where there is nothing to compare.
+    `name` picks a recorded policy if there are several; by default the one of the bundle's name. Raises
+    OtherContractError if the recording does not fit the bundle, and UsageError if there is nothing to compare.
     """
     if not tolerance >= 0:
         raise UsageError(f"the tolerance must be 0 or more, got {tolerance}")

@@ -37,7 +37,7 @@ class BundleCache:
     def bundle(self, digest: str, place: str, fetch: Callable[[Path], None]) -> Iterator[Path]:
         """Give the folder of a bundle, which stays until the block ends; `fetch` fills it unless it is here.
 
-        Raises what `fetch` raises, BundleError where it brings something else, and UnavailableError where the cache
+        Raises what `fetch` raises, BundleError if it brings something else, and UnavailableError if the cache
         cannot be used.
         """
         entry = self.folder / digest
@@ -53,7 +53,7 @@ class BundleCache:
                         raise
                     self._remove_unused()
                 os.utime(entry)
-                fcntl.flock(descriptor, fcntl.LOCK_SH)  # others load it, too
+                fcntl.flock(descriptor, fcntl.LOCK_SH)  # others also load it
                 yield entry
         except OSError as error:
             reason = f"{error.strerror or error}: RLSERVO_CACHE names another folder"

@@ -31,7 +31,7 @@ def is_uri(place: str | Path) -> bool:
 
 
 def place_of(place: str | Path) -> str:
-    """Return an absolute folder (`file://` is one, too) or a URI that holds no secret. Raises UsageError."""
+    """Return an absolute folder (or `file://`) or a URI that holds no secret. Raises UsageError."""
     if not is_uri(place):
         return str(Path(place).expanduser().absolute())
     parts = urlsplit(str(place).rstrip("/"))
@@ -74,9 +74,9 @@ class ObjectStorage:
         return self._succeeded(reply, name)
 
     def create(self, name: str, content: bytes) -> bool:
-        """Write an object unless there is one; return whether it holds this content now, whoever wrote it.
+        """Write an object unless there is one; return whether it holds this content now, no matter who wrote it.
 
-        Raises UnavailableError, also where the storage does not keep what it was given.
+        Raises UnavailableError, also if the storage does not keep what it was given.
         """
         return self._write(name, content, {"IfNoneMatch": "*"})
 
@@ -94,7 +94,7 @@ class ObjectStorage:
             self._succeeded(self._call("list_objects_v2", folder, given, into=page, most=PAGE), folder)
             text = page.getvalue().decode(errors="replace")
             if "<ListBucketResult" not in text:
-                raise UnavailableError(f"{self.uri}/{folder}: what the storage sent is no list of objects")
+                raise UnavailableError(f"{self.uri}/{folder}: the storage did not send a list of objects")
             found += [key.removeprefix(prefix) for key in re.findall(r"<Key>([^<]+)</Key>", text)]
             if "<IsTruncated>true" not in text:
                 return found
@@ -121,7 +121,7 @@ class ObjectStorage:
         into: BinaryIO | None = None,
         most: int = 0,
     ) -> Reply:
-        """Send a request, and once more where the connection breaks or the storage is busy."""
+        """Send a request, and once more if the connection breaks or the storage is busy."""
         place, timeout_s = f"{self.uri}/{name}", self.timeout_s
         headers = {header: given[key] for key, header in _CONDITIONS.items() if key in given}
         reason = ""

@@ -2,7 +2,7 @@
 
 SHA256SUMS is written first and claims the version's number: of two publishers with different bundles one is refused
 before it has written anything else. Objects are only created, never overwritten, and read back; the index is replaced
-only as long as nobody else has replaced it. So a version that can be seen is whole.
+only if no other writer has replaced it. So a version that can be seen is whole.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ ATTEMPTS = 20  # at the index, each after others have published
 def publish(bundle: Bundle, place: str, *, timeout_s: float = 15.0, progress: Callable[[str], object] = str) -> str:
     """Publish a bundle to a folder or URI under its own name and version; return where it is.
 
-    `progress` gets a line per file. Raises ConflictError where that version is there, or is being published,
-    UsageError where nothing can be written, UnavailableError where the storage fails, and BundleError.
+    `progress` gets a line per file. Raises ConflictError if that version is there, or is being published,
+    UsageError if nothing can be written, UnavailableError if the storage fails, and BundleError.
     """
     root = place_of(place)
     for file in bundle.sums:
@@ -89,7 +89,7 @@ def _publish_to_storage(bundle: Bundle, storage: ObjectStorage, progress: Callab
         if not storage.create(name, content):
             raise ConflictError(
                 f"{storage.uri}/{name} holds another file than {bundle.path / file}: the version is being published by "
-                "somebody else, or was left unfinished; publish as another version (--version next)"
+                "another command, or was left unfinished; publish as another version (--version next)"
             )
     for attempt in range(ATTEMPTS):
         index, tag = read_index()
@@ -99,11 +99,11 @@ def _publish_to_storage(bundle: Bundle, storage: ObjectStorage, progress: Callab
         if storage.replace(INDEX, content, tag) if tag else storage.create(INDEX, content):
             return
         time.sleep(0.05 * attempt)
-    raise UnavailableError(f"{storage.uri}/{INDEX}: others keep publishing; give the same command again")
+    raise UnavailableError(f"{storage.uri}/{INDEX}: others keep publishing; run the same command again")
 
 
 def _with(index: Index, bundle: Bundle, place: object) -> bytes:
-    """Return the content of an index with one more line. Raises ConflictError where the version has one."""
+    """Return the content of an index with one more line. Raises ConflictError if the version has one."""
     policies = {name: dict(versions) for name, versions in index.policies.items()}
     there = policies.setdefault(bundle.contract.name, {}).setdefault(bundle.contract.version, bundle.digest)
     if policies == index.policies or there != bundle.digest:

@@ -4,7 +4,7 @@
     <uri>/<name>/<version>/...   the bundle's files, which never change
 
 Whoever may write there wrote them: names, sizes and numbers are checked before anything is made of them. What is in
-the cache needs no storage, so what runs goes on, and starts again, while the storage is unreachable.
+the cache needs no storage, so what runs continues, and starts again, while the storage is unreachable.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Index(BaseModel):
                 first = error.errors(include_url=False)[0]
                 where = ".".join(str(part)[:80] for part in first["loc"])
                 reason = f"{where}: {first['msg']} (given: {first['input']!r:.80})"
-            raise BundleError(f"{place} is no index of versions: {reason[:300]}") from None
+            raise BundleError(f"{place} is not an index of versions: {reason[:300]}") from None
 
 
 class RemoteRepository:
@@ -66,7 +66,7 @@ class RemoteRepository:
         self._limits = limits
 
     def versions(self) -> dict[Key, str]:
-        """Return the hash of every published version. Raises UnavailableError, and BundleError where there is none."""
+        """Return the hash of every published version. Raises UnavailableError, and BundleError if there is none."""
         try:
             index = Index.parse(self._storage.read(INDEX, MAX_INDEX_BYTES)[0], f"{self.uri}/{INDEX}")
         except FileNotFoundError:
@@ -107,6 +107,6 @@ class RemoteRepository:
 
 
 def check_file_type(name: str, place: Any) -> None:
-    """Raise BundleError for a file that is no data of a bundle."""
+    """Raise BundleError for a file that does not belong to a bundle."""
     if PurePosixPath(name).suffix not in DATA_SUFFIXES:
         raise BundleError(f"{place} lists {name}: a published bundle holds {', '.join(DATA_SUFFIXES)} and {SUMS_FILE}")

@@ -1,7 +1,7 @@
-"""Bundles by name and version, in folders and behind URIs; their hashes tell them apart.
+"""Bundles by name and version, in folders and behind URIs; distinguished by their hashes.
 
 A name or version that a request brings is only ever compared with what the places hold; no path is made of it.
-Everything here blocks (hashing, onnxruntime, golden vectors, networks), and may do so for ever where a file system
+Everything here blocks (hashing, onnxruntime, golden vectors, networks), and may do so indefinitely where a file system
 hangs: `versions/version_loader.py` calls it through `BlockingCalls`.
 """
 
@@ -33,7 +33,7 @@ STORAGE_TIMEOUT_S = 15.0
 
 @dataclass
 class _Listing:
-    """What one look through all places saw."""
+    """Result of one look through all places."""
 
     found: dict[Key, tuple[str, str]] = field(default_factory=dict)  # (hash, where it is)
     errors: dict[Key, RlservoError] = field(default_factory=dict)  # of what cannot be served
@@ -106,7 +106,7 @@ class Repository:
         """Return (version, hash) of a bundle; None is the newest one.
 
         Raises UnknownPolicyError or UnknownVersionError, what is wrong with the bundle of that name and version, and
-        UnavailableError where a storage that does not answer may have it.
+        UnavailableError if a storage that does not answer may have it.
         """
         listing = self._look()
         digests = {v: digest for (n, v), digest in listing.digests().items() if n == name}
@@ -133,8 +133,8 @@ class Repository:
     def fetch(self, name: str, version: str, digest: str) -> Iterator[Path]:
         """Give the folder of an accepted bundle, which stays until the block ends.
 
-        Raises BundleTamperedError where the bundle of that name and version has another hash by now, and what is wrong
-        with it where it cannot be served.
+        Raises BundleTamperedError if the bundle of that name and version has another hash by now, and what is wrong
+        with it if it cannot be served.
         """
         errors: list[RlservoError] = []
         folder = self._seen.get((name, version, digest))

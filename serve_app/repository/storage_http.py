@@ -32,7 +32,7 @@ class TooLongReplyError(Exception):
 
 @dataclass(frozen=True)
 class Reply:
-    """What a server answered; the body of a success is elsewhere."""
+    """Answer of a server; the body of a success is elsewhere."""
 
     status: int
     headers: HTTPMessage

@@ -56,7 +56,7 @@ def rollout(
     from the same number. With rate 'real' the loop keeps the control rate on an absolute schedule, as on a robot: a
     period that is missed is counted and skipped, never caught up in a burst. `video` receives the frames of the first
     `video_episodes` episodes at the control rate; drawing happens inside the loop, so it counts as its time.
-    A policy behind a URL is told rewards and ends, for a server that records or promotes by success. `record` receives
+    A policy behind a URL gets rewards and ends, for a server that records or promotes by success. `record` receives
     every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
     `disturb` disturbs environment and robot (`latency=3,noise=real`; `disturbance.py` has the kinds).
     A real robot takes a policy only if its contract has an evaluation under latency, or with `unproven`.
@@ -201,7 +201,7 @@ class _Pacer:
         self._due: float | None = None
 
     def restart(self) -> None:
-        """Begin the schedule anew: the next step runs at once, and the others follow from it."""
+        """Restart the schedule: the next step runs at once, and the others follow from it."""
         self._due = None
 
     def wait(self) -> None:

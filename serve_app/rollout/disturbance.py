@@ -78,7 +78,7 @@ def disturb_env(env: gym.Env[Any, Any], disturbance: Disturbance) -> gym.Env[Any
     """Return the environment with the disturbance. Raises DisturbanceError, naming what the environment lacks."""
     from gymnasium.envs.registration import load_env_creator
 
-    # By name, as Gymnasium's registry has classes: driving an environment of somebody else needs no simulator of ours.
+    # By name, as Gymnasium's registry has classes: driving a third-party environment needs no simulator of ours.
     wrap: Callable[..., Any] = load_env_creator(WRAPPER)
     try:
         wrapped: gym.Env[Any, Any] = wrap(env, **disturbance.arguments)

@@ -41,7 +41,7 @@ Z_95 = 1.96
 
 @dataclass(frozen=True)
 class DisturbedRow:
-    """What one disturbance came to. Success is None where the environment does not say."""
+    """Result under one disturbance. Success is None if the environment does not say."""
 
     disturbance: str
     episodes: int
@@ -148,7 +148,7 @@ def check_plot(out: Path) -> None:
 
 
 def plot_table(table: DisturbanceTable, out: str | Path) -> None:
-    """Draw success (or the return, where there is none) with its interval, a line for each disturbance.
+    """Draw success (or the return, if there is none) with its interval, a line for each disturbance.
 
     Raises UsageError where matplotlib is missing.
     """

@@ -33,18 +33,18 @@ from rlservo.serve_app.interface import ActingPolicy, Observation
 logger = logging.getLogger(__name__)
 
 LOG_EVERY_S = 10.0
-FIRST_TRIES = 10  # to get an episode's first action, where there is none to hold yet
+FIRST_TRIES = 10  # to get an episode's first action, if there is none to hold yet
 
 
 class StoppedError(RlservoError):
-    """The policy did not answer, and the loop was told to stop then."""
+    """The policy did not answer, and the fallback is to stop."""
 
     code = "stopped"
 
 
 @dataclass
 class LinkCounts:
-    """What became of the requests for actions."""
+    """Counts of late, failed and replaced actions."""
 
     late: int = 0  # no answer within the deadline
     unavailable: int = 0  # the server could not be reached, or refused for now
@@ -69,7 +69,7 @@ class WithFallback(ActingPolicy):
     ) -> None:
         """`fallback`: 'hold' repeats the last action, 'zero' sends zeros, 'stop' raises StoppedError, or an action.
 
-        `on_fallback` is told why, each time. Raises UsageError where the action does not fit the policy's space.
+        `on_fallback` gets the reason each time. Raises UsageError if the action does not fit the policy's space.
         """
         self._policy = policy
         self._fallback = fallback
@@ -85,16 +85,16 @@ class WithFallback(ActingPolicy):
         self._logged_at = -LOG_EVERY_S
         self.counts = LinkCounts()
         self.failure: RlservoError | None = None
-        """Why the last action is the fallback's; None where the policy gave it."""
+        """Why the last action is the fallback's; None if the policy gave it."""
 
     @property
     def name(self) -> str:
-        """What the fallback is, in a word."""
+        """Name of the fallback."""
         return self._fallback if isinstance(self._fallback, str) else "given action"
 
     @property
     def policy(self) -> ActingPolicy:
-        """What is wrapped."""
+        """The wrapped policy."""
         return self._policy
 
     @property
@@ -106,9 +106,9 @@ class WithFallback(ActingPolicy):
     ) -> Any:
         """Return the policy's action, or the fallback's when it did not answer in time or at all.
 
-        Where there is nothing to hold yet, an episode's first action is asked for several times.
+        If there is nothing to hold yet, an episode's first action is asked for several times.
 
-        Raises StoppedError where the fallback is to stop, or to hold before there was an action, and all that is not a
+        Raises StoppedError if the fallback is to stop, or to hold before there was an action, and all that is not a
         matter of waiting: a wrong observation, an unsafe action.
         """
         more: dict[str, Any] = {} if reward is None else {"reward": reward}
@@ -186,13 +186,15 @@ def _zero(contract: Contract) -> Any:
     leaves = leaf_specs(contract.action_space, "action")
     choice = next((name for name, leaf in leaves.items() if np.dtype(leaf.dtype).kind != "f"), None)
     if choice is not None:
-        raise UsageError(f"{choice} of policy '{contract.name}' is a choice, of which zero is one: give an action")
+        raise UsageError(
+            f"{choice} of policy '{contract.name}' is a choice, and zero is one of the choices: give an action"
+        )
     zeros = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
     return _parse_action(contract, build_action(contract.action_space, zeros))
 
 
 def _parse_action(contract: Contract, action: Any) -> Any:
-    """Return a given action as the space has it; raise UsageError where it is none."""
+    """Return a given action as the space has it; raise UsageError if it is none."""
     space: SpaceSpec = contract.action_space
     leaves: dict[str, Any] = {}
     try:
@@ -209,5 +211,5 @@ def _parse_action(contract: Contract, action: Any) -> Any:
                 )
             leaves[name] = cast
     except (RequestError, ValueError, TypeError) as error:
-        raise UsageError(f"the fallback is no action of policy '{contract.name}': {error}") from error
+        raise UsageError(f"the fallback is not an action of policy '{contract.name}': {error}") from error
     return build_action(space, leaves)

@@ -36,7 +36,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class Link:
-    """How the connection to the policy did, over every step of the run."""
+    """Counts of the connection to the policy, over every step of the run."""
 
     fallback: str | None  # what was chosen for when there is no answer
     late: int  # no answer within the deadline

@@ -71,7 +71,7 @@ class Drift:
 def training_moments(contract: Contract) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return each observed element's mean and standard deviation in training, flat.
 
-    None where the contract has no filter over the raw observation.
+    None if the contract has no filter over the raw observation.
     """
     space = contract.observation_space
     step = contract.baked_in[0] if contract.baked_in else None

@@ -1,4 +1,4 @@
-"""Numbers of callers read as arrays: which fit, the slack at their bounds, and sentences on what is no number."""
+"""Callers' numbers as arrays: which fit, the slack at their bounds, and errors for what is not a number."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rlservo.export.contract.spaces import LeafSpec, iter_elements
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 LISTED = 8  # names listed in a message before "and N more"
-RELATIVE_SLACK = 1e-5  # of the bound, or of 1 where that is larger
+RELATIVE_SLACK = 1e-5  # of the bound, or of 1 if that is larger
 
 
 def rounding_slack(low: NDArray[Any], high: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.float64]:
@@ -51,7 +51,7 @@ def to_array(given: Any) -> NDArray[Any]:
 
 
 def find_unfit(array: NDArray[Any], dtype: np.dtype[Any]) -> tuple[NDArray[np.bool_], str] | None:
-    """Return (which numbers an integer or bool `dtype` does not have, why); None where it has all of them.
+    """Return (which numbers an integer or bool `dtype` does not have, why); None if it has all of them.
 
     A float so large that it stands for several integers fits none: the sender may have meant another one.
     """
@@ -90,7 +90,7 @@ def parse_array(given: Any, dtype: str, what: str) -> NDArray[Any]:
 
 
 def first_non_number(value: Any, where: tuple[int, ...]) -> tuple[tuple[int, ...], Any] | None:
-    """Return the path and value of the first leaf that is no number an array can hold."""
+    """Return the path and value of the first leaf that an array of numbers cannot hold."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):

@@ -36,7 +36,7 @@ ONNX_TYPES = {
 }  # fmt: skip
 
 LARGEST_MADE = 32 << 20
-"""[bytes] of a graph that is made anew without its value head: nobody acts meanwhile, 0.6 ms for each megabyte."""
+"""[bytes] of a graph that is rebuilt without its value head: acting waits meanwhile, 0.6 ms for each megabyte."""
 
 PROOF_S = 10.0
 """[s] for the golden vectors, of which a policy's network computes thousands in a second: a graph can have loops."""
@@ -113,7 +113,7 @@ def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
 
 
 def leaves_value_out(bundle: Bundle) -> bool:
-    """Whether what acts is the graph without its value head: where it has one, and is not large."""
+    """Whether what acts is the graph without its value head: if it has one, and is not large."""
     has_value = any(tensor.name == VALUE for tensor in bundle.contract.outputs)
     return has_value and bundle.onnx.stat().st_size <= LARGEST_MADE
 
@@ -232,7 +232,7 @@ def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str,
 
 
 def check_rows(bundle: Bundle, run: Run) -> None:
-    """Refuse to compute observations together where that is something else than one by one. Raises BundleError."""
+    """Refuse to compute observations together if that is something else than one by one. Raises BundleError."""
     inputs, _ = bundle.golden()
     names = acting_outputs(bundle.contract)
     rows = {tensor.name: np.resize(inputs[tensor.name], (3, *inputs[tensor.name].shape[1:]))

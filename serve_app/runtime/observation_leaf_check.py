@@ -106,7 +106,7 @@ class LeafParser:
         return (array, values) if sum(map(abs, values)) < LARGE else None
 
     def _read(self, obs: Any) -> tuple[NDArray[Any], list[float] | None, bool]:
-        """Return (array, its numbers where they are few, whether `obs` was a batch), checked but for its bounds."""
+        """Return (array, its numbers if they are few, whether `obs` was a batch), checked but for its bounds."""
         array: NDArray[Any]
         if type(obs) is np.ndarray:
             array = obs
@@ -245,7 +245,7 @@ class LeafParser:
         )
 
     def _refuse_values(self, obs: Any, array: NDArray[Any]) -> NoReturn:
-        """The array is of strings or objects: name the first element that is no number."""
+        """The array is of strings or objects: name the first element that is not a number."""
         path = first_non_number(obs, ())
         if path is None:
             self._refuse(f"it holds {array.dtype} values, not numbers")

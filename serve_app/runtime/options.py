@@ -1,6 +1,6 @@
 """Per-policy runtime options: out-of-bounds observations, action step limit, micro-batching.
 
-One small model, so that whoever configures policies (the server's settings, a deployment's file) can hold it by name.
+One small model, so that the server's settings and a deployment's file can hold it by name.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ Step = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class PolicyOptions(BaseModel):
-    """How one policy treats what lies outside."""
+    """Options of one policy at its limits."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     out_of_bounds: Literal["accept", "warn", "clip", "refuse"] = "warn"
-    """An observation outside the space's bounds: use it as it is, use it and say so, use it clipped and say so, or
+    """An observation outside the space's bounds: use it as it is, use it and warn, clip it and warn, or
     refuse it. RLlib itself accepts; a policy has seldom been trained there."""
 
     max_action_step: Step | tuple[Step | None, ...] | dict[str, Step | tuple[Step | None, ...]] | None = None
@@ -26,7 +26,7 @@ class PolicyOptions(BaseModel):
     one per element in row-major order (null: any), or for a nested action a map from `action.<path>` to such."""
 
     beyond_action_step: Literal["limit", "refuse"] = "limit"
-    """What happens to a larger step: made as large as is allowed, and said so, or refused."""
+    """Treatment of a larger step: limited with a warning, or refused."""
 
     micro_batch: Annotated[int, Field(ge=0, le=1024)] = 0
     """The most single observations that a server computes in one run of the network, of those that are there at the
@@ -35,7 +35,7 @@ class PolicyOptions(BaseModel):
     requests that explore or say anything of an episode."""
 
     record: bool = True
-    """Whether a server that records (`--record`) records this policy, too."""
+    """Whether a server that records (`--record`) also records this policy."""
 
 
 DEFAULT_OPTIONS = PolicyOptions()

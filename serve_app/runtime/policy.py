@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     import onnxruntime
 
 logger = logging.getLogger(__name__)
-SHOWN_HASH = 12  # hexadecimal digits: enough to tell the graphs apart that ever bear one name and version
+SHOWN_HASH = 12  # hexadecimal digits: enough to distinguish the graphs of one name and version
 NOTICE_EVERY_S = 60.0  # an observation out of bounds comes a hundred times a second, and is worth a line a minute
 Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
 """Computes tensors `[batch, ...]` by name from tensors by name."""
@@ -55,12 +55,12 @@ Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What the policy would have done in an episode that took another course (`Policy.follow`)."""
+    """Decision of the policy in an episode that took another course (`Policy.follow`)."""
 
     leaves: dict[str, NDArray[Any]]
     """The deterministic action by tensor name, `[batch, *shape]`."""
     inputs: NDArray[Any] | None
-    """`action_dist_inputs`, where the policy has a distribution."""
+    """`action_dist_inputs`, if the policy has a distribution."""
     state: State
     """For the next step."""
 
@@ -74,19 +74,19 @@ class Step:
     leaves: dict[str, NDArray[Any]]
     """The action by tensor name, `[batch, *shape]`."""
     state: State
-    """What the next step needs, `[batch, *shape]`; empty for a stateless policy."""
+    """State for the next step, `[batch, *shape]`; empty for a stateless policy."""
     batch: int | None
-    """How many observations there were; None for one that came alone."""
+    """Number of observations; None for one that came alone."""
     inputs: Mapping[str, NDArray[Any]]
-    """What the network was given, by tensor name."""
+    """Inputs of the network, by tensor name."""
     notices: tuple[str, ...] = ()
-    """What was out of bounds or beyond a limit, and used all the same."""
+    """Warnings on values out of bounds or beyond a limit that were used anyway."""
     last_action: dict[str, NDArray[Any]] | None = None
-    """The caller's last action as a limit on the step counted from it, by tensor name; None where it gave none."""
+    """The caller's last action as a limit on the step counted from it, by tensor name; None if it gave none."""
 
     @property
     def rows(self) -> int:
-        """How many episodes it was a step of."""
+        """Number of episodes it was a step of."""
         return self.batch or 1
 
     @property
@@ -125,9 +125,9 @@ class Policy(Closeable):
         self._rng: np.random.Generator | None = None  # numpy.random is 2 MB, of use only to policies that explore
         self.options = options
         self.draw: Draw | None = None
-        """How the last exploring action came about, for a recording; None before the first."""
+        """Draw of the last exploring action, for a recording; None before the first."""
         self.last_notices: tuple[str, ...] = ()
-        """What was out of bounds or beyond a limit at the last `act` and used all the same, for a recording."""
+        """Warnings of the last `act`, for a recording."""
         self.loaded_at = datetime.now(timezone.utc)
         self._unlogged = 0
         self._logged_at = -NOTICE_EVERY_S
@@ -172,7 +172,7 @@ class Policy(Closeable):
 
         `options` say how strict it is at its edges, `limits` how large the bundle's files may be.
 
-        Raises BundleError, BundleTamperedError or GoldenMismatchError, and UsageError where the options do not fit.
+        Raises BundleError, BundleTamperedError or GoldenMismatchError, and UsageError if the options do not fit.
         """
         if threads < 1:
             raise UsageError(f"threads must be 1 or more, got {threads}")
@@ -207,7 +207,7 @@ class Policy(Closeable):
 
     @property
     def digest(self) -> str:
-        """What tells the loaded bundle from every other of its name and version."""
+        """Identity of the loaded bundle among those of its name and version."""
         return self._bundle.digest
 
     def act(
@@ -215,9 +215,9 @@ class Policy(Closeable):
     ) -> Any:
         """Return the action for `obs`: one for one observation, a batch for a batch (see `ActingPolicy.act`).
 
-        A nested observation is given, and a nested action returned, in the space's own form. A recurrent policy goes
-        on from the `act` before, `reset()` begins an episode; a batch is so many episodes side by side, row i going on
-        from row i. `reward` is what the last action brought, for a policy that was trained to see it.
+        A nested observation is given, and a nested action returned, in the space's own form. A recurrent policy
+        continues from the `act` before, `reset()` begins an episode; in a batch each row is an episode of its own.
+        `reward` is what the last action brought, for a policy that was trained to see it.
 
         Raises ObservationError when `obs` does not fit the contract, RequestError when the policy cannot explore, lacks
         the reward, or remembers another number of episodes, and ActionError when what came out is not finite or not in
@@ -310,7 +310,7 @@ class Policy(Closeable):
         return Answer(action, inputs, self._state_tensors.next_state(computed, gave))
 
     def value(self, obs: Observation) -> NDArray[Any] | None:
-        """Return the critic's value of each observation `[batch]`; None where the graph has none, or remembers.
+        """Return the critic's value of each observation `[batch]`; None if the graph has none, or remembers.
 
         The first call opens the whole graph, of which acting may need a part. Raises what `parse` and `load` raise.
         """
@@ -350,7 +350,7 @@ class Policy(Closeable):
         return lambda feed: dict(zip(names, run(names, feed), strict=True))
 
     def check_rows(self) -> None:
-        """Raise BundleError where the network computes several observations otherwise than each by itself."""
+        """Raise BundleError if the network computes several observations otherwise than each by itself."""
         check_rows(self._bundle, self._open().run)
 
     def fingerprint(self, inputs: Mapping[str, NDArray[Any]]) -> bytes:

@@ -29,10 +29,10 @@ class StateTensors:
         self.has_reward = any(tensor.name == REWARD for tensor in contract.inputs)
         self._choices = contract.action_space if isinstance(contract.action_space, DiscreteSpec) else None
         self.outputs = [f"state_out.{name}" for name in self._specs]
-        """The graph's outputs to ask for beside the action."""
+        """The graph's outputs to ask for besides the action."""
 
     def inputs(self, state: State | None, rows: int, reward: ArrayLike | None) -> dict[str, NDArray[Any]]:
-        """Return the graph's inputs beside the observation; a state of None begins an episode in every row.
+        """Return the graph's inputs besides the observation; a state of None begins an episode in every row.
 
         Raises RequestError when the policy needs a reward, and none that fits is given.
         """
@@ -43,7 +43,7 @@ class StateTensors:
         return inputs
 
     def next_state(self, computed: Mapping[str, NDArray[Any]], sampled: Mapping[str, NDArray[Any]] | None) -> State:
-        """Return the next state from the graph's outputs; `sampled` is the action where it is not the graph's own."""
+        """Return the next state from the graph's outputs; `sampled` is the action if it is not the graph's own."""
         after = {name: computed[f"state_out.{name}"] for name in self._specs}
         if sampled is not None and self._choices is not None:
             for name, spec in self._specs.items():

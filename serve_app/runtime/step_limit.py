@@ -24,7 +24,7 @@ class StepLimit:
     """The limits of one policy, by leaf of its action space (`action` or `action.<path>`)."""
 
     def __init__(self, policy: str, leaves: Mapping[str, LeafSpec], options: PolicyOptions) -> None:
-        """Raise UsageError where the options do not fit the action space."""
+        """Raise UsageError if the options do not fit the action space."""
         self._policy = policy
         self._leaves = leaves
         self._refuses = options.beyond_action_step == "refuse"
@@ -64,7 +64,7 @@ class StepLimit:
     ) -> tuple[dict[str, NDArray[Any]], tuple[str, ...]]:
         """Return (the action within its limits, a sentence for each leaf that was limited).
 
-        Raises ActionError where the options refuse instead.
+        Raises ActionError if the options refuse instead.
         """
         notices: list[str] = []
         limited = dict(action)

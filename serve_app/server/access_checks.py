@@ -42,7 +42,7 @@ HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
 LABEL = LABEL_HEADER.encode()
 HEADERS = "rlservo.headers"  # in a connection's scope: what `fold_headers` gave
-REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, beside the protocol's own
+REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, besides the protocol's own
 ANY_HOST = "*"
 
 
@@ -94,7 +94,7 @@ class Hosts:
 
 
 def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key | None:
-    """Return the key that opens what a route, or a method, grants, None where it needs none.
+    """Return the key that opens what a route, or a method, grants, None if it needs none.
 
     It counts as a request of that key. Raises UnauthenticatedError, ForbiddenError or RateLimitError.
     """
@@ -196,7 +196,7 @@ def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
 
 
 def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
-    """Return a header as text, None where it is not there."""
+    """Return a header as text, None if it is not there."""
     value = headers.get(name)
     return None if value is None else value.decode("latin-1")
 

@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 def operator_key(file: Path) -> Iterator[str]:
     """Write a new key to `file`, for this user alone, and remove it in the end.
 
-    Gives its `sha256:<hash>`; '' where the file cannot be written, which is logged.
+    Gives its `sha256:<hash>`; '' if the file cannot be written, which is logged.
     """
     key, _ = new_key("operator", admin=True)
     digest = digest_of(key)
@@ -29,7 +29,7 @@ def operator_key(file: Path) -> Iterator[str]:
         try:
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             file.unlink(missing_ok=True)  # of a server that was killed
-            # Made anew and for us alone: whoever put a file or a link there before does not get to read it.
+            # Created for us alone: a file or link that another user put there is not used.
             descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
             with os.fdopen(descriptor, "w") as stream:
                 stream.write(key + "\n")

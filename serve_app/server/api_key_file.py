@@ -25,7 +25,7 @@ STALE_S = 10.0  # [s] without an answer of the file system until the keys count 
 
 
 class CurrentKeys:
-    """`Keys` that follow their file for as long as somebody holds this object."""
+    """`Keys` that follow their file while this object exists."""
 
     def __init__(self, settings: ServerSettings) -> None:
         """Read what the settings name, as `Keys.from_settings`. Raises UsageError."""
@@ -40,7 +40,7 @@ class CurrentKeys:
         self._refused = ""
         self._looked_at = time.monotonic()
         self.changes = 0
-        """Counts the changes, so that whoever has checked a key before can see whether to check it again."""
+        """Number of changes, so that a caller can see whether to check a key again."""
         if file is not None:
             watcher = threading.Thread(target=_watch, args=(weakref.ref(self),), name="key-file", daemon=True)
             watcher.start()

@@ -33,7 +33,7 @@ LINE = re.compile(
     r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})"
     r"(?:\s+rate=(?P<rate>[0-9]{1,6}(?:\.[0-9]{1,3})?)(?:\s+burst=(?P<burst>[1-9][0-9]{0,5}))?)?"
 )
-KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets can tell what they found
+KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets recognise it
 A_KEY = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{16,}")
 KEY_BYTES = 32
 LONGEST_FILE = 1 << 20  # [bytes] of the key file: some ten thousand keys
@@ -44,23 +44,23 @@ Endpoint = TypeVar("Endpoint")
 
 
 class Role(str, Enum):
-    """What a key is for; an admin key may also do all that an act key may."""
+    """Role of a key; an admin key may also do all that an act key may."""
 
     act = "act"
     admin = "admin"
 
 
 class Access(Enum):
-    """Who may use a route or a method; `grant` and the route classes write it down where a route is made."""
+    """Access to a route or a method; `grant` and the route classes write it down where a route is made."""
 
     open = "open"
-    """Everybody, without a key: what orchestrators probe, and web pages that tell nothing of policies by themselves."""
+    """Every client, without a key: probes of orchestrators, and web pages that hold no data of policies."""
 
     act = "act"
-    """Whoever has a key; where the server has none, everybody."""
+    """Clients with a key; if the server has no keys, all clients."""
 
     admin = "admin"
-    """Whoever has an admin key, or the operator's; where the server has none, nobody."""
+    """Clients with an admin key or the operator's; if the server has none, no one."""
 
 
 def grant(access: Access) -> Callable[[Endpoint], Endpoint]:
@@ -74,7 +74,7 @@ def grant(access: Access) -> Callable[[Endpoint], Endpoint]:
 
 
 def access_of(route: Any) -> Access:
-    """Return who may use a route; where nobody has said so, administrators alone."""
+    """Return who may use a route; by default administrators alone."""
     for part in (route, getattr(route, "endpoint", None)):
         found = getattr(part, ACCESS, None)
         if isinstance(found, Access):
@@ -84,14 +84,14 @@ def access_of(route: Any) -> Access:
 
 @dataclass(frozen=True)
 class RateLimit:
-    """How often a key may ask, on each replica."""
+    """Rate limit of a key, on each replica."""
 
     rate: float  # requests a second
     burst: int  # requests at once, after a pause
 
     @classmethod
     def parse(cls, rate: str | None, burst: str | None) -> RateLimit | None:
-        """Return a line's limit; the burst is a second's requests where it is not said. Raises ValueError for 0."""
+        """Return a line's limit; the burst is a second's requests if it is not said. Raises ValueError for 0."""
         if rate is None:
             return None
         if not float(rate):
@@ -115,7 +115,7 @@ class Keys:
 
     keys: tuple[Key, ...] = ()
     operator: Key | None = None
-    """For administration; a server with this one alone still asks nobody for a key who only wants actions."""
+    """For administration; a server with this one alone needs no key for actions."""
 
     @classmethod
     def from_settings(cls, settings: ServerSettings, *, file_content: bytes | None = None) -> Self:
@@ -155,7 +155,7 @@ def without_keys(text: str) -> str:
 def new_key(label: str, *, admin: bool = False, rate: float | None = None, burst: int | None = None) -> tuple[str, str]:
     """Return (the key, for the client alone; its line, for the server). Raises UsageError."""
     if burst is not None and rate is None:
-        raise UsageError("a burst is of a rate: say how many requests a second as well")
+        raise UsageError("--burst needs a rate: also give the requests per second")
     key = KEY_PREFIX + secrets.token_urlsafe(KEY_BYTES)
     line = f"{label} {'admin' if admin else 'act'} sha256:{hashlib.sha256(key.encode()).hexdigest()}"
     if LINE.fullmatch(line) is None:
@@ -172,15 +172,15 @@ def check_exposure(host: str, settings: ServerSettings) -> Keys:
     keys = Keys.from_settings(settings)
     if not keys.keys and not settings.allow_unauthenticated and not is_loopback(host):
         raise UsageError(
-            f"listening on {host} without API keys would let whoever reaches this port ask for actions: make a key "
-            "with 'rlservo key LABEL' and name its file in RLSERVO_API_KEYS_FILE, listen on 127.0.0.1, or say "
+            f"listening on {host} without API keys would let anyone who can reach this port request actions: make a "
+            "key with 'rlservo key LABEL' and name its file in RLSERVO_API_KEYS_FILE, listen on 127.0.0.1, or set "
             "RLSERVO_ALLOW_UNAUTHENTICATED=1"
         )
     return keys
 
 
 def read_key_file(file: Path) -> bytes:
-    """Return the file's content. Raises UsageError where it cannot be read or anybody could have written it."""
+    """Return the file's content. Raises UsageError if it cannot be read or anybody could have written it."""
     try:
         with open_regular(file, LONGEST_FILE) as stream:
             mode = os.fstat(stream.fileno()).st_mode

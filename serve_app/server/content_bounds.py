@@ -22,7 +22,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.policy_store import PolicyStore
 
 SMALL = 1 << 14  # [bytes] content up to which no parser takes long
-SPARE = 1000  # values beside observations and states: options, tensors, names
+SPARE = 1000  # values besides observations and states: options, tensors, names
 SPARE_BYTES = 1 << 16
 NUMBER_BYTES = 64  # of a number's text, with what separates and indents it
 LENGTH, ARRAYS = b"length", b"arrays"
@@ -38,9 +38,9 @@ class ContentBounds:
     values: int
     """Entries of lists and maps, and these once more, in msgpack, where arrays are maps."""
     counts: Mapping[bytes, int]
-    """How often each of MARKS may stand in JSON."""
+    """Allowed number of each of MARKS in JSON."""
     densities: Mapping[bytes, float]
-    """How often it may stand there per byte: small bodies of large observations have few lists, too."""
+    """Allowed number per byte: small bodies of large observations also have few lists."""
 
     @classmethod
     def of(cls, contract: Contract, max_batch: int) -> ContentBounds:
@@ -62,7 +62,7 @@ class ContentBounds:
         )
 
     def exceeded_by(self, content: bytes) -> str:
-        """Return what JSON holds more of than can be needed, '' where it holds no more."""
+        """Return what JSON holds more of than can be needed, '' if it holds no more."""
         for mark, most in self.counts.items():
             most = min(most, SPARE + int(self.densities.get(mark, 1.0) * len(content)))
             if content.count(mark) > most:

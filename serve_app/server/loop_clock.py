@@ -25,7 +25,7 @@ class LoopClock:
         self.next_tick = float("inf")
         """When it is due, by `time.perf_counter`; the clock does not run yet."""
         self.unknown_until = 0.0
-        """Until then, nobody knows how long what is read had waited."""
+        """Until then it is unknown how long what is read had waited."""
 
     def start(self) -> None:
         """Tick in the running event loop from now on."""
@@ -37,7 +37,7 @@ class LoopClock:
         now = time.perf_counter()
         behind = now - self.next_tick
         if behind > self._limit_s:
-            logger.warning("the event loop stood still for %.1f s: what waited for it meanwhile is refused", behind)
+            logger.warning("the event loop was blocked for %.1f s: requests that waited meanwhile are refused", behind)
             self.unknown_until = now + SETTLE_S
         elif now < self.unknown_until and behind > TICK_S:  # still reading
             self.unknown_until = now + SETTLE_S

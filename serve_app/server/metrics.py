@@ -49,7 +49,7 @@ def shared_by_workers() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Totals:
-    """What one policy's version has answered since the start, over all protocols."""
+    """Answers of one policy's version since the start, over all protocols."""
 
     requests: int
     failures: int
@@ -57,7 +57,7 @@ class Totals:
     runs: int  # of the network
     request_s: float
     inference_s: float
-    last_answer_ms: int  # since 1970; 0 where there was none
+    last_answer_ms: int  # since 1970; 0 if there was none
 
 
 class Answers:

@@ -16,7 +16,7 @@ from rlservo.serve_app.versions.serving_plan import Plan
 
 
 class OfflineCommands:
-    """What `AdminClient` does by a server. Every method raises what is wrong with the repository or the command."""
+    """Commands of `AdminClient` without a server. Each raises what is wrong with the repository or the command."""
 
     def __init__(self, places: Sequence[str]) -> None:
         """The places are what `rlservo serve` is given, in the same order. Raises UsageError."""
@@ -34,7 +34,7 @@ class OfflineCommands:
     def listing(self) -> dict[str, Any]:
         """Return the newest plan, and for each policy the versions of the repository that it does not load.
 
-        Raises BundleError or UnavailableError where there is neither a plan nor a policy.
+        Raises BundleError or UnavailableError if there is neither a plan nor a policy.
         """
         return asyncio.run(self._listing())
 

@@ -11,7 +11,7 @@ from rlservo.serve_app.server.api_keys import Key, RateLimit
 
 
 class RateLimits:
-    """What each key with a limit may still ask. Keys without one are never seen here."""
+    """Remaining requests of each key with a limit. Keys without one are never seen here."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -20,7 +20,7 @@ class RateLimits:
         """Requests refused, by label."""
 
     def spend(self, key: Key, limit: RateLimit) -> None:
-        """Count a request of a key. Raises RateLimitError where it has asked too often."""
+        """Count a request of a key. Raises RateLimitError if it has asked too often."""
         now = self._clock()
         tokens, since = self._buckets.get(key.label, (float(limit.burst), now))
         tokens = min(float(limit.burst), tokens + (now - since) * limit.rate)

@@ -10,7 +10,7 @@ from rlservo.serve_app.versions.policy_store import Decision
 
 
 def reply_fields(request: Request, decision: Decision) -> dict[str, Any]:
-    """Return all that a reply says beside the action; what there is nothing to say of is left out.
+    """Return a reply's fields besides the action; empty ones are left out.
 
     `policy`, `version`, `infer_ms`, `seq`, `warnings` (a tuple of sentences), `session_id`, `session_step`, `state`
     (a dict of arrays, with what `carried_state.py` adds), `timestamp`, `received_at`, `sent_at`.

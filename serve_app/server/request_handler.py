@@ -293,7 +293,7 @@ class RequestHandler:
         asked: str | None = None,
         counted_as: str | None = None,
     ) -> None:
-        """Count and log a request that got no action; names that are not loaded are not told apart.
+        """Count and log a request that got no action; names that are not loaded share one count.
 
         `peer` is the address it came from, for the log of what was refused before it was routed; `asked` is the version
         that was asked and failed, where it came so far; `counted_as` is the code in the metrics, where it is another.

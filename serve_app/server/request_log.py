@@ -66,7 +66,7 @@ def configure(settings: ServerSettings, *, replica: str = "") -> None:
 
 
 def _log_administration(settings: ServerSettings, replica: str) -> None:
-    """Write who administers whatever the log's level, and to the audit's file where there is one."""
+    """Write who administers whatever the log's level, and to the audit's file if there is one."""
     administration.setLevel(logging.INFO)
     for previous in list(administration.handlers):
         administration.removeHandler(previous)

@@ -38,7 +38,7 @@ with needs_extra("record", what="recording"):
 
 logger = logging.getLogger(__name__)
 
-MOST_EPISODES = 65_536  # whose steps are counted; of more, the one that was silent longest begins anew
+MOST_EPISODES = 65_536  # whose steps are counted; of more, the one that was silent longest starts over
 LONGEST_REQUEST_ID = 128  # of a longer one, the beginning: a header may have 16 KB
 NO_EPISODE = Episode()
 
@@ -47,7 +47,7 @@ class RequestRecorder:
     """Records the requests of one replica."""
 
     def __init__(self, settings: ServerSettings) -> None:
-        """Record into the folder that `settings` name. Raises UsageError where nothing can be written there."""
+        """Record into the folder that `settings` name. Raises UsageError if nothing can be written there."""
         assert settings.record is not None
         self.recorder = Recorder(
             Path(settings.record), max_file_bytes=settings.record_file_bytes, max_folder_bytes=settings.record_bytes
@@ -111,7 +111,7 @@ class RequestRecorder:
             )  # fmt: skip
             self.recorder.record(outcome)
         if ends:
-            return  # its action is for nobody
+            return  # its action is not used
         record = DecisionRecord(
             known, obs, decision.action, episode, step, taken_s * 1e3, request.explore, seq=request.seq,
             request_id=_request_id(request), warnings=decision.notices, rows=rows,
@@ -127,7 +127,7 @@ class RequestRecorder:
     def _record_failure(self, request: Request, store: PolicyStore, code: str, taken_ms: float) -> None:
         said = request.episode or NO_EPISODE
         if said.final_status is not None:
-            return  # no decision was asked for, and the episode goes on until its end is told
+            return  # no decision was asked for, and the episode continues until its end is reported
         session_id = said.session_id
         label = request.label if session_id is None else str(session_id)
         try:
@@ -160,7 +160,7 @@ class RequestRecorder:
         episode = _episode_of(request)
         if not episode:
             return "", 0
-        # A memory that goes on is no episode's beginning, whatever was said of its end or was forgotten here.
+        # A memory that continues does not begin an episode, whatever was reported of its end or forgotten here.
         least = note.step - 1 if note is not None and note.step is not None and decision.policy.is_stateful else 0
         step = self._count(decision.name, episode, said.reset, least)
         if said.end or said.final_status is not None:

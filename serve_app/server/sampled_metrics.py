@@ -14,7 +14,7 @@ from rlservo.serve_app.server.metrics import SUCCESS
 from rlservo.serve_app.server.request_handler import RequestHandler
 
 EVERY_S = 1.0
-MAX_ELEMENTS = 128  # an image's pixels are no series each: only the largest is shown
+MAX_ELEMENTS = 128  # not a series for each pixel of an image: only the largest is shown
 LARGEST = "largest"
 
 logger = logging.getLogger(__name__)

@@ -26,7 +26,7 @@ MEMORY = "memory"  # of this process: where sessions are kept by default
 
 
 class ServerSettings(BaseModel):
-    """What may be set about a policy server."""
+    """Settings of a policy server."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -41,93 +41,93 @@ class ServerSettings(BaseModel):
     """More observations in one request are refused with 413: the event loop computes a batch in one go."""
 
     body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
-    """[s] A client that takes longer to send its body is answered 408 (embedded server; on a cluster nginx or an
-    Ingress in front of Ray Serve has to do it)."""
+    """[s] A client that takes longer to send its body gets 408 (embedded server; on a cluster nginx or an Ingress must
+    do it)."""
 
     max_ongoing_requests: int = Field(128, ge=1)
-    """Requests that may wait for one process at once; further ones are answered 503 immediately."""
+    """Most requests that may wait for one process; further ones get 503 immediately."""
 
     max_queue_ms: float = Field(1000.0, gt=0, allow_inf_nan=False)
-    """[ms] Requests that have waited longer in a replica are answered 503 instead of being computed."""
+    """[ms] Requests that have waited longer get 503 and are not computed."""
 
     max_incoming: int = Field(512, ge=1)
-    """Requests whose body may be half sent at once, per process; those that come complete do not count."""
+    """Most requests per process whose body is still being sent."""
 
     max_streams: int = Field(256, ge=1)
-    """Streams (WebSocket, gRPC) that may be open at once, per replica."""
+    """Most streams (WebSocket, gRPC) that may be open, per process."""
 
     max_connections_per_address: int = Field(1024, ge=0)
-    """Connections that one client address may have to a process of the embedded server, of 4096 altogether; further
-    ones are answered 429, many more are closed at once. 0: no bound, for a server behind a proxy."""
+    """Most connections of one client address to a process of the embedded server, of 4096 altogether; further ones get
+    429, many more are closed at once. 0: no bound, for a server behind a proxy."""
 
     trusted_proxies: str = ""
     """Addresses, separated by commas, of proxies in front of the embedded server whose `X-Forwarded-For` names the
-    client, for the log and the bound above it; no one's by default."""
+    client, for the log and the bound above; none by default."""
 
     grpc_reflection: bool = False
     """Answer gRPC's reflection service, by which grpcurl and others find methods and messages (embedded server)."""
 
     stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
-    """[s] A stream (WebSocket, gRPC) whose client says nothing for so long is closed."""
+    """[s] A stream (WebSocket, gRPC) that was silent for this long is closed."""
 
     api_keys_file: str | None = None
     """File of the API keys' hashes, a line each: `<label> <act|admin> sha256:<hash>`; `rlservo key` makes them."""
 
     api_keys: str = Field("", repr=False)
-    """The same lines, separated by commas, for where a variable is easier to set than a file."""
+    """The same lines, separated by commas, if a variable is easier to set than a file."""
 
     operator_key: str = Field("", repr=False, pattern=r"^(sha256:[0-9a-f]{64})?$")
-    """`sha256:<hash>` of a key for administration alone; unlike `api_keys` it asks nobody else for a key."""
+    """`sha256:<hash>` of a key for administration alone; unlike `api_keys` it leaves other clients without one."""
 
     allow_unauthenticated: bool = False
-    """Listen beyond this machine without any key: whoever reaches the port can ask for actions."""
+    """Listen beyond this machine without any key: anyone who can reach the port can request actions."""
 
     allowed_hosts: str = ""
-    """Names, separated by commas, by which requests may call this server beside `localhost`, the address listened on
+    """Names, separated by commas, that requests may use for this server besides `localhost`, the address listened on
     and, beyond this machine, every address and the machine's own name; `*` is any. A server beyond this machine with
     API keys takes any name unless some are given here: a web page whose name leads to it has no key."""
 
     default_policy: str | None = None
-    """The policy of a WebSocket at `/`, where openpi's clients connect; the only one, where there is one.
-    `rlservo serve --default-policy` sets it, too."""
+    """Policy of a WebSocket at `/`, where openpi's clients connect; if there is one policy, that one. Also set by
+    `rlservo serve --default-policy`."""
 
     log_file: str | None = None
     """Append the log to this file; without one it goes to standard error, which Ray keeps in its session folder."""
 
     audit_file: str | None = None
-    """Append a line for every command of administration, carried out or refused, to this file, in addition to the log.
-    Every replica of a machine appends to the same one."""
+    """Also append a line for every command of administration, carried out or refused, to this file. All processes of a
+    machine append to the same one."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """The least that is logged; at `info`, every request that got no action."""
+    """Lowest level that is logged; `info` includes every request that got no action."""
 
     log_requests: bool = False
-    """Log also every request that got its action: a line costs about as much as the policy."""
+    """Also log every request that got its action: a line costs about as much as the policy."""
 
     log_values: bool = False
-    """Log the sentences of errors, which may name values of observations."""
+    """Log error messages, which may name values of observations."""
 
     session_store: str = Field(MEMORY, repr=False)  # the URL may hold a password
     """Place of the sessions that a client names by id: `memory` of the process, or for several workers or replicas
     `redis://[USER:PASSWORD@]HOST:PORT/DATABASE` (`rediss://` with TLS, `unix://` for a socket). Each server needs a
-    database of its own. `rlservo serve --session-store` sets it, too."""
+    database of its own. Also set by `rlservo serve --session-store`."""
 
     max_sessions: int = Field(1024, ge=1)
     """Episodes one process remembers at once, in sessions in its memory and on streams (a batch is so many); a further
     one is answered 503."""
 
     session_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
-    """[s] A session without a step for so long is forgotten; a stream's lives as long as the stream."""
+    """[s] A session without a step for this long is forgotten; a stream's lives as long as the stream."""
 
     policy_options: dict[str, PolicyOptions] = {}
-    """How strict each policy is at its edges, by policy name; '*' is for the others. As a variable: a JSON object."""
+    """Options of each policy, by policy name; '*' is for the others. As a variable: a JSON object."""
 
     record: str | None = None
     """Record every decision into this folder, except of policies whose options have `"record": false`. Observations may
     be private: off by default. Also set by `rlservo serve --record`."""
 
     record_file_bytes: int = Field(256 << 20, ge=1 << 20)
-    """A recording goes on in a new file at this size, or after an hour."""
+    """A recording continues in a new file at this size, or after an hour."""
 
     record_bytes: int = Field(10 << 30, ge=2 << 20)
     """The oldest recordings in the folder are deleted beyond it; at least twice `record_file_bytes`."""
@@ -156,7 +156,7 @@ class ServerSettings(BaseModel):
     replicas share it. `$XDG_CACHE_HOME/rlservo/bundles`, else the same below `~/.cache`, when left out."""
 
     cache_bytes: int = Field(10 << 30, ge=1 << 20)
-    """The cache's size at most: what was used longest ago is removed for what is new, what is in use never."""
+    """Largest size of the cache: the least recently used versions are removed, those in use never."""
 
     storage_timeout_s: float = Field(15.0, gt=0, allow_inf_nan=False)
     """[s] A call to a remote repository (a list, a manifest, a block of a file) that takes longer is given up. Below
@@ -164,15 +164,15 @@ class ServerSettings(BaseModel):
 
     poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
     """[s] Look through the places of policies this often, and load versions that are newer than those known, as
-    `rlservo policy load` does: ready, not in use. Off by default. `rlservo serve --poll` sets it, too. The plan is read
-    twice a second, in object storage every 5 s, or this often where that is more often."""
+    `rlservo policy load` does: ready, not in use. Off by default. Also set by `rlservo serve --poll`. The plan is read
+    twice a second, in object storage every 5 s, or at this interval if it is shorter."""
 
     docs: bool = True
-    """Serve web pages, from files that come with the server: what runs at `/`, the API's documentation at /docs."""
+    """Serve web pages from the server's own files: the status page at `/`, the API's documentation at /docs."""
 
     @property
     def bundle_limits(self) -> BundleLimits:
-        """How large a bundle's files may be."""
+        """Size limits of a bundle's files."""
         from rlservo.export.contract.bundle import (
             BundleLimits,  # which imports numpy: `rlservo key` reads the settings, too
         )

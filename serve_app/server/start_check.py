@@ -22,7 +22,7 @@ def load_served(
 ) -> PolicyStore:
     """Load and prove what a server of these folders starts with; a repository without a plan gets its first one.
 
-    Raises UsageError or BundleError, and UnavailableError where a file system or storage does not answer.
+    Raises UsageError or BundleError, and UnavailableError if a file system or storage does not answer.
     """
     settings = settings or ServerSettings.from_environment(environment={})
     control = PlanFollower(version_loader(paths, settings), plan_files(paths, settings))

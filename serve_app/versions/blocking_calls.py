@@ -1,8 +1,8 @@
 """Calls into a file system that may never return, in threads that can be given up.
 
-A network file system that is gone blocks whoever opens, reads or even looks at a file, and nothing can interrupt that.
-So such a call runs in a thread of its own, for which nobody waits longer than a time-out; a thread that was given up
-ends when the file system comes back, or with the process. There are never more than a few of them.
+A network file system that is gone blocks every caller that opens, reads or even looks at a file, and nothing can
+interrupt that. So such a call runs in a thread of its own, which is waited for no longer than a time-out; a
+thread that was given up ends when the file system comes back, or with the process. There are only a few of them.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class BlockingCalls:
             await asyncio.wait_for(self._free.acquire(), timeout_s)
         except asyncio.TimeoutError:  # which is Python's own from 3.11 on
             raise UnavailableError(
-                f"{what} could not begin within {timeout_s:g} s: {self._limit} earlier calls have not come back "
+                f"{what} could not start within {timeout_s:g} s: {self._limit} earlier calls have not come back "
                 "from the file system"
             ) from None
         returned = asyncio.wrap_future(self._start(function, arguments))
@@ -55,7 +55,7 @@ class BlockingCalls:
                 if not done and left_s >= SILENCE_S:
                     logger.warning("waiting for %s (%.0f s)", what, time.monotonic() - began)
         finally:
-            returned.cancel()  # if it has not returned: nobody waits for it any more
+            returned.cancel()  # if it has not returned: it is no longer waited for
         if not done:
             raise UnavailableError(
                 f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?"

@@ -81,7 +81,7 @@ class Batcher:
         return await mine
 
     def compute_now(self, feed: Tensors) -> RunResult:
-        """Compute a batch that came as one: it waits for nobody. Raises what `run` raises."""
+        """Compute a batch that came as one, without waiting. Raises what `run` raises."""
         started = time.perf_counter()
         outputs = self._run(feed)
         return RunResult(outputs, (time.perf_counter() - started) * 1e3, 1)  # one run, whatever is in it

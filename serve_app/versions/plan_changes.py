@@ -79,7 +79,7 @@ def load(plan: Plan, name: str, version: str, digest: str) -> dict[str, PolicyPl
     """Add a version, or take its bundle as it is now; what clients get stays as it is.
 
     The first version of a policy that is not served becomes its `production`: it changes no reply but a 404. Raises
-    ConflictError where the folder holds another bundle than the one in use under this version.
+    ConflictError if the folder holds another bundle than the one in use under this version.
     """
     policy = plan.policies.get(name) or PolicyPlan(versions={})
     uses = _uses(policy, version)
@@ -113,7 +113,7 @@ def set_alias(
     """Let an alias lead to a loaded version, or with None remove it; `production` can only be moved.
 
     `expected` is where it leads as far as the caller knows: who has not seen another's move does not undo it. The same
-    command twice is no contradiction.
+    command twice is not a contradiction.
     """
     policy = plan.policy(name)
     aliases = dict(policy.aliases)
@@ -147,7 +147,7 @@ def roll_back(plan: Plan, name: str, alias: str, *, expected: str | None = None)
         raise _not_as_expected(policy, name, alias, expected)
     earlier = policy.history.get(alias, ())
     if not earlier:
-        raise ConflictError(f"the alias '{alias}' of policy '{name}' has led nowhere else: there is no way back")
+        raise ConflictError(f"the alias '{alias}' of policy '{name}' has no previous version to roll back to")
     version = earlier[-1]
     versions = {version: policy.unloaded.get(version, ""), **policy.versions}
     changed = _with(plan, name, policy, versions=versions, aliases={**policy.aliases, alias: version})
@@ -177,7 +177,7 @@ def _with(plan: Plan, name: str, policy: PolicyPlan, **changes: Any) -> dict[str
 
 
 def _checked(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
-    """Return the policy with these changes: sorted, in use as somebody said, with the way back from what it was."""
+    """Return the policy with these changes: sorted, in use as commanded, with the way back from what it was."""
     values: dict[str, Any] = {field: getattr(was, field) for field in PolicyPlan.model_fields} | changes
     versions: dict[str, str] = dict(sorted(values["versions"].items(), key=lambda item: version_key(item[0])))
     aliases: dict[str, str] = dict(values["aliases"])
@@ -219,8 +219,8 @@ def _require(name: str, policy: PolicyPlan, reference: str) -> None:
     if policy.version_of(reference) is None:
         what = "version" if reference[:1].isdigit() else "alias"
         raise UnknownVersionError(
-            f"policy '{name}' has no {what} '{reference[:32]}': loaded are {_listed(policy.versions)}, "
-            f"aliases are {_listed(policy.aliases)}"
+            f"policy '{name}' has no {what} '{reference[:32]}': expected one of {_listed(policy.versions)}; "
+            f"aliases: {_listed(policy.aliases)}"
         )
 
 

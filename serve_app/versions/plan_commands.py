@@ -14,7 +14,7 @@ from rlservo.serve_app.versions.serving_plan import PRODUCTION, Alias, Canary, P
 
 
 class Control(Protocol):
-    """What changes a plan: a process that serves it, or a writer alone."""
+    """Writer of a plan: a process that serves it, or a writer alone."""
 
     async def load(self, name: str, version: str | None, *, what: str) -> Plan:
         """Find a version in the repository (None: the newest), and add it."""
@@ -130,7 +130,7 @@ COMMANDS: dict[str, type[Command]] = {
 
 
 class Changed(BaseModel):
-    """What is served of a policy after a command."""
+    """State of a policy after a command."""
 
     generation: int = Field(description="The number of the plan with it.")
     policy: str

@@ -41,7 +41,7 @@ class FolderStorage:
         self._root = root
 
     def read(self, name: str, most: int) -> tuple[bytes, str]:
-        """Return a file. Raises FileNotFoundError, and UnavailableError where it cannot be read."""
+        """Return a file. Raises FileNotFoundError, and UnavailableError if it cannot be read."""
         file = self._root / name
         try:
             # Opening the folder has NFS ask its server what is new in it; a look for the file alone would not.
@@ -65,7 +65,7 @@ class FolderStorage:
                     stream.flush()
                     os.fsync(stream.fileno())
                 with contextlib.suppress(FileExistsError):
-                    os.link(beside, file)  # whole at once, and only where there is none
+                    os.link(beside, file)  # whole at once, and only if there is none
             finally:
                 beside.unlink(missing_ok=True)
         except OSError as error:
@@ -73,7 +73,7 @@ class FolderStorage:
         return self.read(name, MAX_PLAN_BYTES)[0] == content
 
     def names(self, folder: str) -> list[str]:
-        """Return the names below a folder; none where it does not exist. Raises UnavailableError."""
+        """Return the names below a folder; none if it does not exist. Raises UnavailableError."""
         try:
             return [file.name for file in (self._root / folder).iterdir()]
         except FileNotFoundError:
@@ -106,7 +106,7 @@ class PlanFiles:
 
     @property
     def place(self) -> str:
-        """Where the plans are."""
+        """Place of the plans."""
         return f"{self._storage.uri}/{FOLDER}"
 
     @property
@@ -132,7 +132,7 @@ class PlanFiles:
         return plan
 
     def create(self, plan: Plan) -> bool:
-        """Write a plan under its number; return False where that is taken. Raises UnavailableError."""
+        """Write a plan under its number; return False if that is taken. Raises UnavailableError."""
         content = plan.model_dump_json(indent=1).encode() + b"\n"
         if not self._storage.create(_name(plan.generation), content):
             return False
@@ -169,7 +169,7 @@ class PlanFiles:
             first = error.errors(include_url=False)[0]
             where = ".".join(map(str, first["loc"]))
             raise UnavailableError(
-                f"{self._storage.uri}/{name} is no plan that this rlservo reads: {where}: {first['msg']}"
+                f"{self._storage.uri}/{name} is not a plan that this rlservo can read: {where}: {first['msg']}"
             ) from None
         self._remember(content)
         return plan

@@ -1,7 +1,7 @@
 """Versions that one process serves: it follows the plan, and takes commands that change it.
 
-A process swaps one store for the next and keeps the old one where it cannot follow. What touches bundles or plans
-happens in threads, with a time-out, and nothing is locked meanwhile: requests and other changes go on, also where a
+A process swaps one store for the next and keeps the old one if it cannot follow. What touches bundles or plans
+happens in threads, with a time-out, and nothing is locked meanwhile: requests and other changes continue, also if a
 file system hangs.
 """
 
@@ -30,12 +30,12 @@ from rlservo.serve_app.versions.version_loader import Loadable, VersionLoader
 logger = logging.getLogger(__name__)
 
 RETRY_PERIOD_S = 30.0  # [s] between attempts at a version that could not be loaded
-REFUSED_PERIOD_S = 300.0  # [s] between attempts at a new version that was refused, when nobody asked for it
+REFUSED_PERIOD_S = 300.0  # [s] between attempts at a new version that was refused, when no command asked for it
 
 
 @dataclass(frozen=True)
 class VersionState:
-    """How one version stands in this process."""
+    """State of one version in this process."""
 
     state: str  # loading, ready or failed
     reason: str = ""
@@ -60,7 +60,7 @@ class PlanFollower:
 
     @property
     def place(self) -> str:
-        """Where the plan is."""
+        """Place of the plan."""
         return self._files.place
 
     @property
@@ -69,7 +69,7 @@ class PlanFollower:
         return tuple(error.message for error in self._failed.values())
 
     async def configure(self, document: Any) -> None:
-        """Serve the plan; where the repository has none yet, first write the one that a configuration means.
+        """Serve the plan; if the repository has none yet, first write the one that a configuration means.
 
         Raises UsageError, BundleError and UnavailableError.
         """
@@ -78,7 +78,7 @@ class PlanFollower:
         plan = await self._writer.at_start(self._config, held)
         if document and not plan_changes.agrees(plan, self._config):
             logger.warning(
-                "plan %d in %s (%s) says otherwise than the configuration, and holds: `rlservo policy` changes it",
+                "plan %d in %s (%s) differs from the configuration and is used: `rlservo policy` changes it",
                 plan.generation,
                 self.place,
                 plan.changed_by,
@@ -140,7 +140,9 @@ class PlanFollower:
             newer = ", ".join(" ".join(key) for key in self._newer(digests)[:10])
             if newer:
                 number = self._generation()
-                logger.warning("newer than what plan %d has, and not loaded: %s (`rlservo policy load`)", number, newer)
+                logger.warning(
+                    "newer than the versions of plan %d, and not loaded: %s (`rlservo policy load`)", number, newer
+                )
 
     async def _follow_always(self) -> None:
         told = ""
@@ -149,15 +151,15 @@ class PlanFollower:
             try:
                 await self.follow()
                 told = ""
-            except Exception as error:  # it may be out of reach for a while; what is served goes on
+            except Exception as error:  # it may be out of reach for a while; what is served continues
                 if str(error) != told:
-                    logger.warning("the plan cannot be followed, what is served goes on: %s", error)
+                    logger.warning("the plan cannot be followed, serving continues unchanged: %s", error)
                 told = str(error)
 
     async def poll_repository(self, period_s: float) -> None:
         """Load what is newer than all versions that the plan knows of a policy, as `load` does, until cancelled.
 
-        What the configuration leaves out is left out here, too; what an operator unloads stays unloaded.
+        What the configuration leaves out is also left out here; what an operator unloads stays unloaded.
         """
         refused_until: dict[Loadable, float] = {}
         told: set[str] = set()
@@ -181,7 +183,7 @@ class PlanFollower:
             except Exception as error:
                 wrong = {str(error)}
             for sentence in sorted(wrong - told):
-                logger.warning("looking for new versions, what is served goes on: %s", sentence)
+                logger.warning("looking for new versions failed, serving continues unchanged: %s", sentence)
             told = wrong
 
     def _newer(self, digests: Mapping[Key, str]) -> list[Key]:
@@ -247,7 +249,7 @@ class PlanFollower:
                 keys = [(name, version, digest) for version, digest in was.versions.items()]
             elif errors and wanted.default in errors:
                 if self.store is not None:
-                    continue  # not served here rather than as another version; `behind` says so
+                    continue  # not served here rather than as another version; `behind` reports it
                 raise BundleError(
                     f"policy '{name}' cannot be served as version {wanted.default}, its default in plan "
                     f"{plan.generation} of {self.place}: {errors[wanted.default].message}"

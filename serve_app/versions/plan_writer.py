@@ -1,4 +1,4 @@
-"""Changes of the plan: proven here, written under the next number, and told of where another was first."""
+"""Changes of the plan: proven here, written under the next number, and reported if another came first."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class PlanWriter:
         return await self._run(lambda: self._files.after(number), "reading")
 
     async def at_start(self, config: ServedConfig, held: list[Policy]) -> Plan:
-        """Return the newest plan; where there is none, write the one that a configuration means, as `change` does.
+        """Return the newest plan; if there is none, write the one that a configuration means, as `change` does.
 
         Where object storage is unreachable, the plan that this machine saw last will do. Raises UsageError,
         BundleError and UnavailableError.
@@ -64,7 +64,7 @@ class PlanWriter:
             first = await self._unwritten(config)
             try:
                 held += await self._loader.prove(first.policies, {})
-            except RefusedError as error:  # nothing is served that could go on
+            except RefusedError as error:  # nothing is served that could continue
                 raise BundleError(error.message, error.details) from None
             plan = first.after(first.policies, "configuration")
             try:

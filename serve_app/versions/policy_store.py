@@ -1,6 +1,6 @@
 """Policies that a server holds: names, versions, aliases, and the one call of every protocol, `act`.
 
-A store does not change: what should be served otherwise is another store, and whoever began with one ends with it.
+A store does not change: a change is another store, and a request ends with the one it began with.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Decision:
     """An array, or dicts and tuples of arrays where the action space is nested."""
     policy: Policy
     inputs: Mapping[str, Any]
-    """What the network was given, by tensor name `[batch, *shape]`."""
+    """Inputs of the network, by tensor name `[batch, *shape]`."""
     name: str
     version: str
     infer_ms: float  # [ms] checking the observation, the network (for all that it ran for), checking the action
@@ -103,8 +103,8 @@ class PolicyStore:
         """Take loaded policies, and by name the plan that each is served by; those `changed` were served otherwise.
 
         A plan may name versions that are not among the policies; an alias, canary or shadow that leads to one is left
-        out. Raises UsageError when the default version is not there: no other takes its place. What goes on of a store
-        that this one `replaces` is the micro-batching of the policies that both have.
+        out. Raises UsageError when the default version is not there: no other takes its place. From a
+        store that this one `replaces` it keeps the micro-batching of the policies that both have.
         """
         self.plans = plans
         self._changed = frozenset(changed)
@@ -132,7 +132,7 @@ class PolicyStore:
         return tuple(self._find(name).versions)
 
     def default(self, name: str) -> str:
-        """The version of whoever asks for none. Raises UnknownPolicyError."""
+        """The version for clients that name none. Raises UnknownPolicyError."""
         return self.get(name).contract.version
 
     def get(self, name: str, version: str | None = None) -> Policy:
@@ -147,9 +147,9 @@ class PolicyStore:
         policy = served.versions.get(plan.version_of(version) or "")
         if policy is None:
             aliases = [alias for alias, target in sorted(plan.aliases.items()) if target in served.versions]
-            also = f", aliases are {', '.join(aliases)}" if aliases else ""
+            also = f"; aliases: {', '.join(aliases)}" if aliases else ""
             raise UnknownVersionError(
-                f"policy '{name}' has no version '{version[:32]}': loaded are {', '.join(served.versions)}{also}",
+                f"policy '{name}' has no version '{version[:32]}': expected one of {', '.join(served.versions)}{also}",
                 {"policy": name, "versions": list(served.versions), "aliases": aliases},
             )
         return policy
@@ -172,21 +172,21 @@ class PolicyStore:
     def is_certain(self, name: str, version: str | None) -> bool:
         """Whether a recurrent state that does not say whose it is can only be of the policy that this request gets.
 
-        So it is where the version itself is named (an alias may lead elsewhere by now), and where there is and was
+        So it is where the version itself is named (an alias may lead elsewhere by now), and if there is and was
         only one.
         """
         versions = self._find(name).versions
         return version in versions or (len(versions) == 1 and name not in self._changed)
 
     def version_of(self, name: str, reference: str) -> str:
-        """Return the version that a version or an alias means, '' where there is none."""
+        """Return the version that a version or an alias means, '' if there is none."""
         try:
             return self.get(name, reference).contract.version
         except UnknownPolicyError:
             return ""
 
     def choose(self, name: str, version: str | None, label: str | None) -> Policy:
-        """Return the policy that a request gets: as `get`, but where a canary runs, a share of the labels get that.
+        """Return the policy that a request gets: as `get`, but when a canary runs, a share of the labels get that.
 
         All requests of a label get the same one, on every replica, for as long as the share does not change; a larger
         share keeps those it had. Raises what `get` raises.
@@ -236,7 +236,7 @@ class PolicyStore:
         label: str | None = None,
         check: Callable[[], None] | None = None,
     ) -> Decision:
-        """Decide as `act` does without exploring; with what else is there in one run where the policy's options say so.
+        """Decide as `act` does without exploring; in one run with the other requests if the policy's options allow it.
 
         `check` is called again right before the network runs. Raises what it and `act` raise.
         """
@@ -299,14 +299,14 @@ def _serve(name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> _Serv
 
 
 def _wants_batches(policy: Policy) -> bool:
-    """Return whether single observations are computed together: the options say so, and nothing else goes in."""
+    """Return whether single observations are computed together: the options allow it, and nothing else goes in."""
     contract = policy.contract
     observed = leaf_specs(contract.observation_space, "obs")
     return policy.options.micro_batch > 1 and not policy.is_stateful and len(contract.inputs) == len(observed)
 
 
 def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision, Step]:
-    """Decide by one step of a policy, `given` what `Policy.step` takes beside the observation; return the step, too."""
+    """Decide by one step of a policy, with `given` for `Policy.step` besides the observation; also return the step."""
     started = time.perf_counter()
     try:
         step = policy.step(obs, **given)
@@ -322,7 +322,7 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
 
 
 def blame(error: Exception, version: str) -> None:
-    """Write the version that was asked on its error: where a canary runs, nobody else knows which one it was."""
+    """Write the version that was asked on its error: with a canary, no one else knows which one it was."""
     error.policy_version = version  # type: ignore[attr-defined]
 
 

@@ -34,7 +34,7 @@ Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Version = Annotated[str, BeforeValidator(_as_text), Field(pattern=VERSION_PATTERN)]
 Alias = Annotated[str, Field(pattern=ALIAS_PATTERN)]
 Reference = Annotated[str, BeforeValidator(_as_text), Field(pattern=f"{VERSION_PATTERN}|{ALIAS_PATTERN}")]
-"""A version, or an alias that leads to one: whatever moves the alias moves this, too."""
+"""A version, or an alias that leads to one: moving the alias also moves this."""
 
 
 class _Model(BaseModel):
@@ -46,11 +46,11 @@ class Canary(_Model):
 
     version: Reference
     share: float = Field(gt=0, le=1)
-    """Of the sessions; of the requests, where they name no session."""
+    """Of the sessions; of the requests, if they name no session."""
 
 
 class PolicyConfig(_Model):
-    """What a configuration says of one policy."""
+    """Configuration of one policy."""
 
     versions: tuple[Version, ...] | None = None
     """To be loaded; all that the repository holds when left out."""
@@ -62,7 +62,7 @@ class PolicyConfig(_Model):
     canary: Canary | None = None
 
     shadow: Reference | None = None
-    """A version that computes, too, and whose action is only compared."""
+    """A version that is also computed, and whose action is only compared."""
 
 
 class ServedConfig(_Model):
@@ -71,7 +71,7 @@ class ServedConfig(_Model):
     policies: dict[Name, PolicyConfig] = {}
 
     unlisted: Literal["load", "ignore"] = "load"
-    """What becomes of the repository's policies that `policies` does not name."""
+    """Treatment of the repository's policies that `policies` does not name."""
 
     @property
     def wants_all(self) -> bool:
@@ -100,7 +100,7 @@ class PolicyPlan(_Model):
 
     aliases: dict[Alias, Version] = {}
     history: dict[Alias, tuple[Version, ...]] = {}
-    """Where an alias led before, the last one last."""
+    """Previous versions of an alias, the latest last."""
 
     unloaded: dict[Version, str] = {}
     """The bundles of versions that were loaded before: a rollback leads back to the same ones, and no poll to them."""
@@ -117,17 +117,17 @@ class PolicyPlan(_Model):
 
     @property
     def default(self) -> str | None:
-        """The version of whoever asks for none; None where nothing is loaded."""
+        """The version for clients that name none; None if nothing is loaded."""
         return self.aliases.get(PRODUCTION)
 
     def version_of(self, reference: str) -> str | None:
-        """Return the version that a version or an alias means, None where there is none."""
+        """Return the version that a version or an alias means, None if there is none."""
         version = self.aliases.get(reference, reference)
         return version if version in self.versions else None
 
 
 class Plan(_Model):
-    """What every process is to serve."""
+    """Policies and versions that every process serves."""
 
     generation: int
     """Its number: 1 is a repository's first."""

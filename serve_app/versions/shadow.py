@@ -28,7 +28,7 @@ Record = Callable[[str, str, str, Iterable[float]], None]
 
 
 class _Series:
-    """Differences and counts of one candidate beside one default version."""
+    """Differences and counts of one candidate against one default version."""
 
     def __init__(self) -> None:
         self.compared = 0
@@ -50,7 +50,7 @@ class Shadows:
     def offer(self, shadow: Shadow, obs: Any, decision: Decision) -> None:
         """Have the candidate compute on `obs` some time later. Never waits.
 
-        One that remembers its episode is left out: it would need a recurrent state of its own beside every caller's.
+        One that remembers its episode is left out: it would need a recurrent state of its own for every caller.
         """
         if shadow.policy.is_stateful:
             self._series_of(shadow, decision).left_out += 1

@@ -29,9 +29,9 @@ Result = TypeVar("Result")
 
 
 class VersionLoader:
-    """Loads and proves versions while the event loop goes on, also where a file system hangs.
+    """Loads and proves versions while the event loop continues, also if a file system hangs.
 
-    A version that somebody still holds is not loaded a second time.
+    A version that is still held is not loaded a second time.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class VersionLoader:
         return self._loaded.get((name, version, digest))
 
     async def available(self, config: ServedConfig) -> dict[str, dict[str, str]]:
-        """Return every bundle's hash by name and version, as `Repository.available`. Raises UnavailableError, too."""
+        """Return every bundle's hash by name and version, as `Repository.available`. Also raises UnavailableError."""
         return await self._look(partial(self._repository.available, needs_all=config.wants_all))
 
     async def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
@@ -83,8 +83,8 @@ class VersionLoader:
     async def load(self, name: str, version: str, digest: str) -> Policy:
         """Load and prove a version unless it is in memory.
 
-        Raises what `Repository.fetch` and `Policy.load` raise, and UnavailableError when it takes too long; it goes on
-        then, and the next call may find it loaded.
+        Raises what `Repository.fetch` and `Policy.load` raise, and UnavailableError when it takes too long; loading
+        continues then, and the next call may find it done.
         """
         key = (name, version, digest)
         policy = self._loaded.get(key)
@@ -108,7 +108,7 @@ class VersionLoader:
         """Load what is new or newly relied on in `policies`, and check that canary and shadow fit the default version.
 
         Return what was loaded, which stays in memory for as long as the caller holds it. Raises RefusedError with all
-        that cannot be served, and UnavailableError where it only could not be read, or not in time.
+        that cannot be served, and UnavailableError if it only could not be read, or not in time.
         """
         held: list[Policy] = []
         failures: list[tuple[Key, RlservoError]] = []

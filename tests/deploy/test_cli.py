@@ -337,7 +337,7 @@ def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
 @pytest.mark.parametrize(
     ("words", "fragment"),
     [
-        ((), "nothing limits it: give --max-error-rate, --max-p99"),
+        ((), "no limit was given: give --max-error-rate, --max-p99"),
         (("--max-error-rate", "0.1"), "--max-error-rate '0.1': expected a number with its unit, such as 0.1%"),
         (("--max-error-rate", "101%"), "at most 100%"),
         (("--max-p99", "20"), "--max-p99 '20': expected a number with its unit, such as 20ms"),

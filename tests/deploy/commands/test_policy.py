@@ -51,11 +51,11 @@ def test_what_is_wrong_is_one_sentence_and_changes_nothing(repository: Path) -> 
     (repository / "ur5" / "1" / "policy.onnx").write_bytes(b"broken")
     for words, sentence, code in (
         (("alias", "ur5", "production=1"), "refused, and nothing has changed: ", 1),
-        (("alias", "ur5", "production=3"), "policy 'ur5' has no version '3': loaded are 1, 2, 10", 1),
+        (("alias", "ur5", "production=3"), "policy 'ur5' has no version '3': expected one of 1, 2, 10", 1),
         (("alias", "mir", "production=3"), "no policy 'mir' is loaded: this server has ur5", 1),
         (("canary", "ur5", "1=7"), "canary: share: Input should be less than or equal to 1", 2),
         (("load", "ur5", "../1"), "load: version: ", 2),
-        (("rollback", "ur5", "--alias", "candidate"), "has led nowhere else: there is no way back", 1),
+        (("rollback", "ur5", "--alias", "candidate"), "has no previous version to roll back to", 1),
     ):
         assert sentence in give(repository, *words, code=code)
     assert len(list((repository / ".plan").iterdir())) == 1

@@ -85,10 +85,10 @@ def test_mir100_and_two_object_lines_are_understood() -> None:
         (UR, "the argument ur_model is missing"),
         (f"{UR} ur_model:=ur7", "ur_model 'ur7' does not exist: expected one of ur3, ur3e"),
         (f"{UR} ur_model:=ur5 speed:=9 colour:=red", "that are not known: speed, colour; expected some of action_cyc"),
-        (f"{UR} ur_model:=ur5 ; rm -rf /", "';' is no launch argument: expected name:=value"),
-        (f"{UR} ur_model:=ur5 --screen", "'--screen' is no launch argument"),
+        (f"{UR} ur_model:=ur5 ; rm -rf /", "';' is not a launch argument: expected name:=value"),
+        (f"{UR} ur_model:=ur5 --screen", "'--screen' is not a launch argument"),
         (f"{UR} ur_model:=ur5 rs_mode:=voxels", "rs_mode 'voxels' does not exist: expected one of only_robot"),
-        (f"{UR} ur_model:=ur5 action_cycle_rate:=fast", "action_cycle_rate:=fast is no number"),
+        (f"{UR} ur_model:=ur5 action_cycle_rate:=fast", "action_cycle_rate:=fast is not a number"),
         (f"{UR} ur_model:=ur5 action_cycle_rate:=-1", "action_cycle_rate is -1 Hz: expected 0.1 to 1000 Hz"),
         (f"{UR} ur_model:=ur5 max_velocity_scale_factor:=2", "expected more than 0, at most 1"),
         (f"{UR} ur_model:=ur5 world_name:=moon.world", "world 'moon.world' does not exist: expected one of empty"),
@@ -105,11 +105,11 @@ def test_mir100_and_two_object_lines_are_understood() -> None:
         ),
         (f"{UR} ur_model:=ur5 server_port:=99999", "port 99999 does not exist"),
         *(
-            (f"{UR} ur_model:=ur5 server_port:={port}", "is no port: expected a whole number, 0 .* to 65535")
+            (f"{UR} ur_model:=ur5 server_port:={port}", "is not a port: expected a whole number, 0 .* to 65535")
             for port in ("inf", "-inf", "nan", "1e400", "50400.9", "50400.0", "-1", "٣", "", "9" * 400, "50_400")
         ),
-        (f"{MIR} server_port:=inf", "server_port:=inf is no port"),
-        (f"{UR} ur_model:=ur5 'a\nb:=1'", r"'a\\nb:=1' is no launch argument: expected name:=value"),
+        (f"{MIR} server_port:=inf", "server_port:=inf is not a port"),
+        (f"{UR} ur_model:=ur5 'a\nb:=1'", r"'a\\nb:=1' is not a launch argument: expected name:=value"),
         (f"{UR} 'ur_model:=ur5\nERROR'", r"ur_model is 'ur5\\nERROR': expected at most 1,000 printable characters"),
         (f"{UR} ur_model:={'u' * 2000}", "expected at most 1,000 printable characters"),
         (f"{UR} " + " ".join(f"a{i}:=1" for i in range(400)), "not known: a0, a1, a2, a3, a4 and 395 more; expected"),

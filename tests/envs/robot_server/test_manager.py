@@ -112,7 +112,7 @@ def test_garbage_is_answered_and_the_manager_goes_on(client: Any) -> None:
     for name in ("StartNewServer", "KillServer", "KillAllServers"):
         answer = client.call(name, b"\xff\xff\xff")
         assert not answer.success
-        assert answer.info == "3 bytes that are no such message"
+        assert answer.info == "3 bytes that are not such a message"
     assert client.call("VerifyConnection", b"\xff\xff\xff").alive
 
 

@@ -50,7 +50,7 @@ def test_checkpoints_that_tune_has_deleted_and_results_that_are_no_numbers_are_p
 
 
 def test_what_cannot_be_picked_is_said_with_what_there_is(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="is no Tune trial or experiment"):
+    with pytest.raises(CheckpointError, match="is not a Tune trial or experiment"):
         best_checkpoint(tmp_path, METRIC, notify=print)
     write_trial(tmp_path / "a", [1.0])
     with pytest.raises(CheckpointError, match=f"reported with its checkpoints were {METRIC}"):

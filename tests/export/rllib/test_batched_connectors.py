@@ -191,7 +191,7 @@ def test_what_does_not_fit_is_refused_by_name() -> None:
     with pytest.raises(UsageError, match=r"observations are Discrete\(16\): the batched connectors take a Box"):
         runner(PPOConfig(), "FrozenLake-v1", 1, batched=True, filtered=True)
     memory = PPOConfig().rl_module(model_config=DefaultModelConfig(use_lstm=True, max_seq_len=4))
-    with pytest.raises(UsageError, match="has a memory"):
+    with pytest.raises(UsageError, match="has memory"):
         runner(memory, "CartPole-v1", 1, batched=True).sample(num_timesteps=2)
 
 

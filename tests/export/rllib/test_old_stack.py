@@ -420,7 +420,7 @@ def filter_of(state: dict[str, Any]) -> dict[str, Any]:
         (
             lambda state: state.pop("connector_configs"),
             UnsupportedError,
-            "holds no agent connectors, so it does not tell what RLlib does to observations",
+            "holds no agent connectors, so it does not show what RLlib does to observations",
         ),
         (
             lambda state: state["connector_configs"]["action"][1].insert(1, ("MyActionDelay", None)),
@@ -528,7 +528,7 @@ def test_a_damaged_algorithm_state_costs_only_the_facts(
     (damaged / "algorithm_state.pkl").write_bytes(b"\x80")
     result = export_checkpoint(damaged, tmp_path / "out", notify=notices.append)
     assert result.contract.provenance.algorithm == "unknown"
-    assert "algorithm, environment and progress cannot be told" in " ".join(notices)
+    assert "algorithm, environment and progress cannot be read" in " ".join(notices)
 
 
 def test_settings_that_an_earlier_ray_did_not_know_take_their_defaults(

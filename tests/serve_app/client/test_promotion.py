@@ -464,7 +464,7 @@ def test_an_alias_that_is_moved_in_the_last_moment_is_not_moved_back(
 
 @pytest.mark.parametrize(
     ("version", "says"),
-    [("9", "has no version 9: loaded are 1, 2, 3, 4"), ("1", "in production already")],
+    [("9", "has no version 9: expected one of 1, 2, 3, 4"), ("1", "in production already")],
 )
 def test_what_cannot_be_promoted_is_refused_before_anything_is_changed(
     run: Any, server: Server, version: str, says: str
@@ -744,7 +744,7 @@ def test_ctrl_c_rolls_back(run: Any, server: Server) -> None:
 def test_a_file_that_is_no_log_is_not_written_to(tmp_path: Path, content: str) -> None:
     file = tmp_path / "notes"
     file.write_text(content)
-    with pytest.raises(UsageError, match="is no promotion's log"), PromotionLog.open(file):
+    with pytest.raises(UsageError, match="is not a promotion's log"), PromotionLog.open(file):
         pass
     assert file.read_text() == content
 

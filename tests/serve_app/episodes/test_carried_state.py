@@ -128,7 +128,7 @@ def test_a_state_without_a_version_is_only_used_where_it_can_be_of_one_alone(
     server.store = PolicyStore([versions["1"], versions["2"]], plans)
     for path in ("leaky", "leaky/versions/production"):
         status, reply = server.act(path, state=bare)
-        assert status == 400 and "does not say of which version" in reply["error"], reply
+        assert status == 400 and "does not name its version" in reply["error"], reply
         assert "('@policy' in 'state', or the parameter 'state_policy'), or name the version" in reply["error"]
     assert server.act("leaky/versions/2", state=bare)[1]["version"] == "2"
     server.store = store_of(versions["2"], changed=["leaky"])  # version 1 was here until a moment ago
@@ -231,7 +231,7 @@ def test_a_stream_hands_a_carried_state_to_its_version(server: Server, versions:
         second = ask(socket, state=first["state"])
         assert second["version"] == "1"
         bare = {"h": first["state"]["h"]}
-        assert "does not say of which version" in ask(socket, state=bare)
+        assert "does not name its version" in ask(socket, state=bare)
     np.testing.assert_allclose(second["actions"][0], in_process(versions["1"], 2)[1], rtol=1e-6)
 
 

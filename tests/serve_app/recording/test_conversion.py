@@ -183,7 +183,7 @@ def test_a_repaired_recording_is_whole_to_every_reader(ur5: Path, tmp_path: Path
 def test_a_recording_that_is_none_is_not_repaired(tmp_path: Path) -> None:
     (tmp_path / "text.mcap").write_text("hello, this is not a recording")
     done = rlservo_here("log", "repair", "text.mcap", "--out", "whole.mcap", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (1, "rlservo: text.mcap is no MCAP file\n")
+    assert (done.returncode, done.stderr) == (1, "rlservo: text.mcap is not an MCAP file\n")
     assert [path.name for path in tmp_path.iterdir()] == ["text.mcap"]
 
 

@@ -447,8 +447,11 @@ def test_foreign_damaged_and_missing_files_are_told_in_a_sentence(ur5: Path, tmp
         writer.add_message(writer.register_channel("/camera", "json", 0), 1, b"{}", 1)
         writer.finish()
     for name, sentence in (
-        ("text", "no MCAP file"), ("empty", "no MCAP file"), ("other", "its topics are /camera"), ("none", "not exist"),
-    ):  # fmt: skip
+        ("text", "not an MCAP file"),
+        ("empty", "not an MCAP file"),
+        ("other", "its topics are /camera"),
+        ("none", "not exist"),
+    ):
         with pytest.raises(RecordingError, match=sentence):
             list(Recording(tmp_path / f"{name}.mcap").entries())
     for size in (len(whole) // 3, len(whole) * 2 // 3, len(whole) - 5):  # cut off anywhere

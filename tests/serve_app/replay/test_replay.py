@@ -171,7 +171,7 @@ def test_command_says_by_its_exit_code_what_it_found(
     code, text = run_cli(monkeypatch, capsys, "replay", file, "--bundle", str(policies / "gridworld"))
     assert code == 2 and "does not fit the bundle gridworld/1" in text and "Traceback" not in text
     code, text = run_cli(monkeypatch, capsys, "replay", str(tmp_path / "text.mcap"), "--bundle", str(policies / "ur5"))
-    assert code == 1 and "is no MCAP file" in text
+    assert code == 1 and "is not an MCAP file" in text
     code, summary = run_cli(monkeypatch, capsys, "log", "info", file, "--json")
     assert code == 0 and summary["policies"][0]["decisions"] == 100
     code, text = run_cli(monkeypatch, capsys, "log", "info", file)

@@ -135,7 +135,9 @@ def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage
     assert next_version(storage.uri, "ur5") == "2" and next_version(storage.uri, "mir") == "1"
     storage.change("DELETE", INDEX)  # as if left half-way: no server sees it, and its number is not free
     assert next_version(storage.uri, "ur5") == "2"
-    with pytest.raises(ConflictError, match=r"ur5/1/SHA256SUMS holds another file than .* published by somebody else"):
+    with pytest.raises(
+        ConflictError, match=r"ur5/1/SHA256SUMS holds another file than .* published by another command"
+    ):
         publish(other, storage.uri)
     put(made, storage.uri, "1")  # the same bundle goes on where it was left
 
@@ -284,7 +286,10 @@ LIES: dict[str, tuple[Lie, str]] = {
         only("2/policy.onnx", lambda *reply: (403, *endless(*reply)[1:])),
         r"/policies/ur5/2/policy\.onnx is refused with the credentials of .*\(status 403\)",
     ),
-    "garbled index": (only(INDEX, lambda p, s, h, b: (s, h, b[:60])), r"/policies/index\.json is no index of versions"),
+    "garbled index": (
+        only(INDEX, lambda p, s, h, b: (s, h, b[:60])),
+        r"/policies/index\.json is not an index of versions",
+    ),
     "endless index": (only(INDEX, endless), r"/policies/index\.json: the storage sends more than the 16,777,216 b"),
     "index is 503": (only(INDEX, busy), r"/policies/index\.json cannot be reached or read"),
 }
@@ -356,7 +361,7 @@ UNFINISHED: dict[str, tuple[str, bytes | None, type[RlservoError], str]] = {
     "swallowed": ("/1/SHA256SUMS", None, UnavailableError, r"/ur5/1/SHA256SUMS is not there after it was written$"),
     "changed": ("/1/policy.onnx", b"another", ConflictError, r"/ur5/1/policy\.onnx holds another file than "),
     "index swallowed": ("/index.json", None, UnavailableError, r"/index\.json is not there after it was written$"),
-    "index changed": ("/index.json", b"{", BundleError, r"/index\.json is no index of versions"),
+    "index changed": ("/index.json", b"{", BundleError, r"/index\.json is not an index of versions"),
 }
 
 
@@ -395,7 +400,7 @@ def test_an_index_that_is_none_withdraws_nothing(page: bytes, made: Path, storag
         await control.configure({})
         storage.tell(only(INDEX, lambda *_: (200, {}, page)))
         digests, errors = repository(storage, cache).look()
-        assert digests == {} and "is no index of versions" in str(errors[0])
+        assert digests == {} and "is not an index of versions" in str(errors[0])
         again = replica(storage.uri, cache=cache)
         await again.configure({})
         assert again.store is not None and again.store.default("ur5") == "1"
@@ -546,16 +551,16 @@ def test_local_folders_import_nothing_of_it(made: Path) -> None:
         ({"policies": {"ur5": {"1": 7}}}, r"policies\.ur5\.1"),
         ({"policies": {"ur5": ["1"]}}, r"policies\.ur5"),
         ({"policies": {}, "more": 1}, "more"),
-        ([], "is no index of versions"),
-        ("[" * 200_000, "is no index of versions"),
-        ("\x00", "is no index of versions"),
+        ([], "is not an index of versions"),
+        ("[" * 200_000, "is not an index of versions"),
+        ("\x00", "is not an index of versions"),
     ],
 )
 def test_a_hostile_index_is_refused_with_a_sentence_that_names_it(document: Any, sentence: str) -> None:
     content = document if isinstance(document, str) else json.dumps(document)
     with pytest.raises(BundleError, match=sentence) as caught:
         Index.parse(content.encode(), "s3://b/index.json")
-    assert caught.value.message.startswith("s3://b/index.json is no index") and len(caught.value.message) < 400
+    assert caught.value.message.startswith("s3://b/index.json is not an index") and len(caught.value.message) < 400
 
 
 def size_of(made: Path) -> int:
@@ -675,12 +680,12 @@ HTTP_LIES: dict[str, tuple[str, Callable[[http.server.SimpleHTTPRequestHandler],
     "packed": (
         "/index.json",
         lambda h: stream(h, {"content-encoding": "deflate"}, zlib.compress(bytes(20 << 20), 1)),
-        "index.json is no index of versions",
+        "index.json is not an index of versions",
     ),
     "folders' links": (
         "/index.json",
         lambda h: stream(h, {"content-type": "text/html"}, b"<a" + b" " * 1500),
-        "index.json is no index of versions",
+        "index.json is not an index of versions",
     ),
     "elsewhere": (
         "/index.json",
@@ -768,7 +773,7 @@ def test_polling_loads_what_is_newer_and_says_once_that_the_storage_is_away(
         await until(lambda: storage.gets(INDEX) > looks + 4)
         assert control.store.versions("ur5") == ("2",)  # what an operator unloaded stays unloaded
         storage.go_away()
-        await until(lambda: "looking for new versions, what is served goes on: s3://" in caplog.text)
+        await until(lambda: "looking for new versions failed, serving continues unchanged: s3://" in caplog.text)
         storage.tell(None)
         await asyncio.to_thread(put, made, storage.uri, "4")
         await until(lambda: control.store is not None and control.store.versions("ur5") == ("2", "4"))

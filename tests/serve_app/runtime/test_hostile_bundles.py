@@ -216,7 +216,7 @@ def test_golden_vectors_that_claim_more_than_they_hold_are_refused(root: Path) -
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (1 << 42,)})
     golden_of(folder, {"input/obs": header.getvalue() + b"\0" * 64})
-    with pytest.raises(BundleError, match=r"'input/obs.npy' says that it is of shape \(4398046511104,\) and holds"):
+    with pytest.raises(BundleError, match=r"'input/obs.npy' declares the shape \(4398046511104,\) and holds"):
         Policy.load(folder)
 
 
@@ -377,7 +377,7 @@ def test_a_file_system_that_hangs_is_given_up_with_a_few_threads_at_most(
     with pytest.raises(RlservoError, match=sentence):
         admin.load("ur5", "10")
     for _ in range(5):
-        with pytest.raises(RlservoError, match=r"given up|could not begin"):
+        with pytest.raises(RlservoError, match=r"given up|could not start"):
             admin.load("ur5", "10")
     assert stalled.waiting <= 4
     work_goes_on(admin, url)

@@ -241,13 +241,13 @@ def test_a_configuration_begins_a_plan_and_commands_rule_after(
                 await fleet.deploy(wrong)
             assert not (tmp_path / FOLDER).exists()
         await fleet.deploy(config("1", "10", production="1"))
-        assert "says otherwise" not in caplog.text
+        assert "differs from the configuration" not in caplog.text
         await fleet.controls[0].change(aliasing("10"), what="alias ur5 production=10")
         whole_new_cluster = [fleet.start(folder, f"new{n}") for n in range(2)]
         for control in whole_new_cluster:
             await control.configure(config("1", "10", production="1"))
             assert control.store is not None and control.store.default("ur5") == "10"
-        assert caplog.text.count("plan 2 in") == 2 and "says otherwise than the configuration, and holds" in caplog.text
+        assert caplog.text.count("plan 2 in") == 2 and "differs from the configuration and is used" in caplog.text
 
     asyncio.run(run())
 
@@ -261,7 +261,7 @@ def test_a_version_exported_since_is_not_in_use_by_itself_and_a_start_says_so(
         fleet = Fleet(folder, folder)
         await fleet.deploy({})
         poll = asyncio.create_task(fleet.controls[0].poll_plan())
-        await until(lambda: "newer than what plan 1 has, and not loaded: ur5 11" in caplog.text)
+        await until(lambda: "newer than the versions of plan 1, and not loaded: ur5 11" in caplog.text)
         assert fleet.defaults() == ["10"]
         poll.cancel()
 
@@ -443,9 +443,9 @@ def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
         poll = asyncio.create_task(control.poll_plan())
         following = tmp_path / FOLDER / "000000002.json"
         following.write_text('{"generation": 2, "policies": {}, "by": "a later rlservo"}')
-        await until(lambda: "000000002.json is no plan that this rlservo reads" in caplog.text)
+        await until(lambda: "000000002.json is not a plan that this rlservo can read" in caplog.text)
         await asyncio.sleep(1.2)
-        assert caplog.text.count("is no plan") == 1 and fleet.defaults() == ["1"]
+        assert caplog.text.count("is not a plan") == 1 and fleet.defaults() == ["1"]
         following.unlink()
         shutil.move(tmp_path / FOLDER, tmp_path / "away")
         with pytest.raises(UnavailableError, match="has lost plan 1, which is served here"):

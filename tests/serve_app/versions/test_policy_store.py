@@ -42,7 +42,7 @@ def test_unknown_names_and_versions_say_what_there_is(policies: Path) -> None:
     store = load_store(policies)
     with pytest.raises(UnknownPolicyError, match="no policy 'ur6' is loaded: this server has gridworld, ur5"):
         store.act("ur6", None, OBS)
-    with pytest.raises(UnknownVersionError, match="no version '3': loaded are 1, 2, 10"):
+    with pytest.raises(UnknownVersionError, match="no version '3': expected one of 1, 2, 10"):
         store.act("ur5", "3", OBS)
     with pytest.raises(UnknownVersionError):
         store.act("ur5", "../../etc", OBS)
