@@ -68,7 +68,8 @@ TOGETHER = {
 LONGEST = (
     "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
     "tests/serve_app/repository/test_remote_repository.py", "ports of server managers",
-    "tests/deploy/cockpit/test_page.py", "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
+    "tests/deploy/cockpit/test_page.py", "tests/system/test_documents_run.py",
+    "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
     "tests/system/test_embedded_server.py", "sweep",
     "tests/export/rllib/test_new_stack.py", "several nodes",
     "tests/serve_app/client/test_bad_line.py", "tests/deploy/test_compose_server.py",
