@@ -70,7 +70,7 @@ class OutcomeRecord:
     commanded: Any = None
     """Command to the robot instead of the action."""
     robot: Mapping[str, Any] | None = None
-    """Of a real robot: its state, its changes, and the limits that were kept."""
+    """State of a real robot, its changes, and the limits that were kept."""
     rows: int = 1
     """Of the decision."""
     wall_ns: int = field(default_factory=time.time_ns)
