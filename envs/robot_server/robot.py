@@ -23,7 +23,12 @@ class RobotState:
 
 
 class Robot(Protocol):
-    """A simulated robot with the server's vocabulary. Every method raises ValueError for what it cannot honour."""
+    """A robot, simulated or real. Every method raises ValueError for what it cannot honour."""
+
+    @property
+    def is_real(self) -> bool:
+        """Whether its cycles last as long as they do, whatever the clock says."""
+        ...
 
     @property
     def camera(self) -> Camera: ...
@@ -47,4 +52,8 @@ class Robot(Protocol):
 
     def idle(self, cycles: int) -> None:
         """Let cycles pass without a command."""
+        ...
+
+    def close(self) -> None:
+        """Close the window, and stop a real robot."""
         ...
