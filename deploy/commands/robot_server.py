@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rlservo.envs.robot_server.settings import Settings
 
 robot_server = typer.Typer(
-    help="Serve a robot, simulated or real, to robo-gym's environments. It is a drop-in for the ROS robot server.",
+    help="Serve a robot to robo-gym's environments. It may be simulated or real, in place of the ROS robot server.",
     no_args_is_help=True,
 )
 
@@ -173,9 +173,9 @@ def robot_latency(
     yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Measure a real arm's latency, from command to motion, and print the evaluation that a policy for it must pass.
+    """Measure a real arm's latency. It prints the evaluation that a policy for this arm must pass.
 
-    wrist_3 turns by 0.05 rad, back and forth.
+    From command to motion: wrist_3 turns by 0.05 rad, back and forth.
 
     Example: `rlservo robot-latency rtde://192.168.0.2 --ur-model ur5e`
     """
