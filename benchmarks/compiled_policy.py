@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -64,7 +64,7 @@ def sides(bundle: Bundle, made: Compiled, compiler: str, folder: Path) -> dict[s
     feed = {tensor.name: inputs[tensor.name][:1] for tensor in bundle.contract.inputs}
     policy, compiled = Policy.load(bundle.path), CompiledPolicy(made.folder)
     ort_run = policy.network()
-    script = torch.jit.load(str(bundle.torchscript))
+    script = cast(Any, torch.jit).load(str(bundle.torchscript))
     tensors = [torch.from_numpy(array) for array in feed.values()]
     obs = feed["obs"][0]
 

@@ -200,7 +200,8 @@ def _share(got: NDArray[Any], expected: NDArray[Any], allowed: NDArray[np.float6
     with np.errstate(invalid="ignore", divide="ignore"):
         same = (a == b) | (np.isnan(a) & np.isnan(b))
         share = np.where(same, 0.0, np.abs(a - b) / allowed.reshape(len(got), -1))
-    return np.nan_to_num(share, nan=np.inf).max(axis=1, initial=0.0)
+    largest: NDArray[np.float64] = np.nan_to_num(share, nan=np.inf).max(axis=1, initial=0.0)
+    return largest
 
 
 def must_not_leave(contract: Contract, outputs: Arrays) -> NDArray[np.bool_]:

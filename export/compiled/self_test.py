@@ -118,7 +118,8 @@ int main(void) {{
 
 
 def _rounded_up(allowed: NDArray[np.float64]) -> NDArray[np.float32]:
-    return np.nextafter(allowed.astype(np.float32), np.float32(np.inf))
+    rounded: NDArray[np.float32] = np.nextafter(allowed.astype(np.float32), np.float32(np.inf))
+    return rounded
 
 
 def _table(what: str, struct: str, name: str, array: NDArray[Any]) -> str:

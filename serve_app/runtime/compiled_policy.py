@@ -63,7 +63,7 @@ class CompiledPolicy(Policy):
         if library.bundle != about["bundle"]:
             raise BundleTamperedError(f"{file} was compiled from another bundle than {COMPILE_FILE} says")
         bundle = Bundle(folder, contract, recorded, about["bundle"])
-        super().__init__(bundle, library, options, graph_hash=recorded[file.name])  # type: ignore[arg-type]  # it has `run`
+        super().__init__(bundle, library, options, graph_hash=recorded[file.name])
 
 
 def open_policy(path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS, check_golden: bool = True) -> Policy:
