@@ -38,6 +38,7 @@ class SharedBlock:
 
     def read(self) -> Any:
         """Return a copy of the newest record (its fields by name); where the writer died, what it had written."""
+        record = self._record.copy()
         for _ in range(TRIES):
             before = self._counter[0]
             record = self._record.copy()

@@ -11,7 +11,7 @@ import json
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +63,7 @@ class CompiledPolicy(Policy):
         if library.bundle != about["bundle"]:
             raise BundleTamperedError(f"{file} was compiled from another bundle than {COMPILE_FILE} says")
         bundle = Bundle(folder, contract, recorded, about["bundle"])
-        super().__init__(bundle, library, options, graph_hash=recorded[file.name])
+        super().__init__(bundle, cast(Any, library), options, graph_hash=recorded[file.name])
 
 
 def open_policy(path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS, check_golden: bool = True) -> Policy:
