@@ -114,7 +114,7 @@ def main() -> None:
             rounds = [{side: measure() for side, measure in measured.items()} for _ in range(options.rounds)]
             document[checkpoint] = {side: min(each[side] for each in rounds) for side in measured}
             document[checkpoint]["library_bytes"] = made.about["proof"]["code_bytes"]
-        for side in document[CHECKPOINTS[0]]:
+        for side in [side for side in document[CHECKPOINTS[0]] if side != "library_bytes"]:
             table.add_row(side, *(f"{document[checkpoint][side]:.1f}" for checkpoint in CHECKPOINTS))
     Console().print(table)
     out = ROOT / "bench"
