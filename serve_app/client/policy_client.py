@@ -93,7 +93,8 @@ class PolicyClient(RemotePolicy):
         super().reset()
         self._begin_label()
         # A version's number leads to itself.
-        self._looks_up = None not in (self._version, self._contract) and self._version != self._contract.version
+        known = self._contract
+        self._looks_up = self._version is not None and known is not None and self._version != known.version
 
     def _begin_label(self) -> None:
         number = secrets.token_hex(8 if self._label is None else 4)

@@ -47,7 +47,7 @@ class OnlineLearner:
             self._group = self._config.build_learner_group(spaces=named)
         except Exception as error:  # the configuration may name anyone's code
             raise CheckpointError(f"{start}: its learner cannot be built: {first_line(error)}") from error
-        self._first_steps = read_facts(self._files.root, str).env_steps or 0
+        self._first_steps = read_facts(self._files.root, lambda _sentence: None).env_steps or 0
         self._acting: dict[Path, EnvToModulePipeline] = {}
         self._env_to_module = pipeline
         self.restore(self._files.root)
@@ -70,7 +70,9 @@ class OnlineLearner:
         """Forget the connectors of a version that is too old to learn from."""
         self._acting.pop(acting, None)
 
-    def update(self, raw: Sequence[SingleAgentEpisode], seen: list[SingleAgentEpisode], steps: int) -> dict[str, float]:
+    def update(
+        self, raw: Sequence[SingleAgentEpisode], seen: Sequence[SingleAgentEpisode], steps: int
+    ) -> dict[str, float]:
         """Learn once from episodes as networks `seen` them; `raw` ones feed the filter. Return losses by name.
 
         `steps` are the environment steps learned from before. Raises RlservoError with the cause.
@@ -78,7 +80,7 @@ class OnlineLearner:
         config = cast(Any, self._config)
         try:
             results = self._group.update(
-                episodes=seen,
+                episodes=list(seen),
                 timesteps={NUM_ENV_STEPS_SAMPLED_LIFETIME: self._first_steps + steps},
                 num_epochs=config.num_epochs,
                 minibatch_size=config.minibatch_size,
@@ -113,7 +115,7 @@ class OnlineLearner:
     def _pipeline(self, checkpoint: Path) -> EnvToModulePipeline:
         place = checkpoint.absolute() / self._files.env_to_module.relative_to(self._files.root)
         try:
-            return cast(EnvToModulePipeline, EnvToModulePipeline.from_checkpoint(str(place)))
+            return EnvToModulePipeline.from_checkpoint(str(place))
         except Exception as error:
             raise CheckpointError(f"{place} cannot be restored: {first_line(error)}") from error
 

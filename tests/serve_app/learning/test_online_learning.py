@@ -190,7 +190,8 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
             cell.run_folder()
 
         def play_and_move(_seconds: float) -> None:
-            cell.play()
+            for _ in range(BATCH // LENGTH):
+                cell.play()
             with cell.admin() as client:
                 client.alias("policy", "learning", "1")
 
