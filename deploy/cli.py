@@ -21,6 +21,7 @@ from rlservo.deploy.commands.demo import demo
 from rlservo.deploy.commands.export import export, prune
 from rlservo.deploy.commands.inspect import inspect
 from rlservo.deploy.commands.key import key
+from rlservo.deploy.commands.learn import learn
 from rlservo.deploy.commands.log import log
 from rlservo.deploy.commands.policy import policy
 from rlservo.deploy.commands.promote import promote
@@ -77,6 +78,7 @@ for command in (
     verify,
     compile,
     publish,
+    learn,
     serve,
     key,
     rollout,

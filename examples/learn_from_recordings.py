@@ -35,7 +35,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from shared.help_text import DefaultsFormatter
-from shared.recorded_episodes import Choice, Recorded, RecordedEpisodes
+from shared.recorded_episodes import RecordedEpisodes
 
 from rlservo import errors
 from rlservo.deploy.terminal import status
@@ -47,6 +47,7 @@ from rlservo.export.checkpoints.location import (
     locate_checkpoint,
 )
 from rlservo.export.rllib import private_names
+from rlservo.serve_app.learning.rllib_episodes import Choice, Recorded, read_recordings, through_connectors
 from rlservo.serve_app.recording.conversion import gym_space
 from rlservo.serve_app.recording.reader import Recording
 
@@ -139,7 +140,7 @@ def start_anew(config: AlgorithmConfig, recorded: Recorded, with_filter: bool) -
     env_to_module = config.build_env_to_module_connector(spaces=given)
     start = Start(env_to_module, config.build_module_to_env_connector(spaces=given), None, None)
     if with_filter:
-        recorded_episodes.through_connectors(recorded.episodes, env_to_module, learn=True)
+        through_connectors(recorded.episodes, env_to_module, learn=True)
     return start
 
 
@@ -274,14 +275,14 @@ def main() -> None:
     torch.set_num_threads(1)
     choice = Choice(rewards=args.run != "BC", status=args.status, modes=args.modes, ahead=args.ahead)
     with status("reading the recordings"):
-        recorded = recorded_episodes.read_recordings(Recording(args.recordings), choice, name=args.policy)
+        recorded = read_recordings(Recording(args.recordings), choice, name=args.policy)
     report(recorded)
     with training_run.ray_session(num_cpus=1):
         config, start, sentence = configure(args, recorded)
         print(f"{args.run} from {sentence}", flush=True)
         learn(
             config,
-            recorded_episodes.through_connectors(recorded.episodes, start.env_to_module),
+            through_connectors(recorded.episodes, start.env_to_module),
             args.epochs,
             args.out,
             start,

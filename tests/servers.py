@@ -296,7 +296,7 @@ def live_server(policies: Path, recurrent: Path, tmp_path_factory: pytest.TempPa
     It is started as a shell script's background job is: with SIGINT ignored.
     SIGINT ends it, with nothing left.
     """
-    key, line = new_key("tests")
+    key, line = new_key("tests", explore=True)
     log = tmp_path_factory.mktemp("log") / "server.jsonl"
     recorded = tmp_path_factory.mktemp("recorded")
     settings = {

@@ -36,6 +36,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "log export nowhere.mcap --to parquet --out out.parquet": ("record",),
     "replay nowhere.mcap --bundle {bundle}": ("record",),
     "estimate nowhere.mcap --bundle {bundle}": ("record",),
+    "learn nowhere --policy ur5 --repository r --recordings r --out o": ("train", "client", "record"),
     "publish {bundle} s3://127.0.0.1/bucket": ("remote",),
     "cockpit --robot-server 127.0.0.1:1": ("cockpit",),
     "rollout rlservo/EndEffectorPositioningURRob-v0 --bundle {bundle} --env-arg robot=rtde://127.0.0.1": ("ur", "sim"),

@@ -35,6 +35,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         "serve_app/rollout",
     },
     "serve_app/repository": {"export/contract"},
+    "serve_app/learning": {
+        "export", "export/contract", "export/checkpoints", "export/rllib", "serve_app/interface.py", "serve_app/client",
+        "serve_app/recording", "serve_app/repository",
+    },
     "serve_app/versions": {"export/contract", "serve_app/interface.py", "serve_app/repository", "serve_app/runtime"},
     "serve_app/episodes": {"export/contract", "serve_app/runtime", "serve_app/versions", "serve_app/wire"},
     "serve_app/server": {
@@ -57,9 +61,9 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 # The folders (or files) that may import a library, by the library's dotted name. The longest name that fits counts.
 ONLY_IN: dict[str, tuple[str, ...]] = {
-    "ray": ("export/rllib/", "serve_app/engines/ray_serve.py"),
+    "ray": ("export/rllib/", "serve_app/engines/ray_serve.py", "serve_app/learning/rllib_"),
     "ray.serve": ("serve_app/engines/ray_serve.py",),
-    "ray.rllib": ("export/rllib/",),
+    "ray.rllib": ("export/rllib/", "serve_app/learning/rllib_"),
     "ray.tune": ("export/rllib/",),
     "uvicorn": ("serve_app/engines/local.py", "serve_app/engines/http_bounds.py"),
     "fastapi": ("serve_app/protocols/",),

@@ -14,6 +14,9 @@ def key(
     admin: Annotated[
         bool, typer.Option("--admin", help="Make a key for administration; robots do not need one.")
     ] = False,
+    explore: Annotated[
+        bool, typer.Option("--explore", help="Let the key ask for exploring actions, too ('rlservo learn').")
+    ] = False,
     rate: Annotated[
         float | None,
         typer.Option(help="Requests per second that each process accepts from this key; unlimited by default."),
@@ -29,7 +32,7 @@ def key(
     """
     from rlservo.serve_app.server.api_keys import new_key
 
-    secret, line = new_key(label, admin=admin, rate=rate, burst=burst)
+    secret, line = new_key(label, admin=admin, explore=explore, rate=rate, burst=burst)
     if as_json:
         print_json({"key": secret, "line": line})
         return

@@ -36,7 +36,8 @@ class PolicyClient(RemotePolicy):
     Without `version` each request gets what the server has in use: where `production` is moved, or a canary begins or
     is ended, a running loop follows, if observations and actions are the same (else the answer is refused). From
     `reset` to `reset` a canary's share is drawn once, and an episode with a recurrent state ends with the version that
-    began it. With `version` the loop stays with that one; an alias is looked up at the first contact.
+    began it. With `version` the loop stays with that one; an alias is looked up at the first request of every
+    episode.
 
     Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
     A recurrent policy's state is kept here and sent along, and so is the last action if the server limits the step
@@ -91,6 +92,9 @@ class PolicyClient(RemotePolicy):
         """Start an episode: the next request carries it. Sends nothing."""
         super().reset()
         self._begin_label()
+        # A version's number leads to itself.
+        known = self._contract
+        self._looks_up = self._version is not None and known is not None and self._version != known.version
 
     def _begin_label(self) -> None:
         number = secrets.token_hex(8 if self._label is None else 4)

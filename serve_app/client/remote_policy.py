@@ -74,6 +74,8 @@ class RemotePolicy(ActingPolicy):
         self._deadline_ms = 1e3 * timeout_s if deadline_ms is None else deadline_ms
         self._episode = episode
         self._contract: Contract | None = None
+        self._looks_up = False
+        """Whether the contract is fetched again before the next request: of an alias, which may lead elsewhere."""
         self._contracts: dict[str, Contract] = {}
         """Of every version that was met."""
         self._reward: float | None = None
@@ -90,7 +92,7 @@ class RemotePolicy(ActingPolicy):
         Raises UnavailableError, DeadlineError, UnknownPolicyError, or UsageError when no policy was named and the
         server has several.
         """
-        if self._contract is None:
+        if self._contract is None or self._looks_up:
             self._meet(self._fetch_contract(None))
             assert self._contract is not None
         return self._contract
@@ -215,7 +217,7 @@ class RemotePolicy(ActingPolicy):
         self._learn(contract)
         if self._contract is not None and contract is not self._contract:
             check_successor(contract, self._contract)
-        self._contract = contract
+        self._contract, self._looks_up = contract, False
 
     def _learn(self, contract: Contract) -> None:
         """Keep the contract of a version; say where it is made for another control rate."""

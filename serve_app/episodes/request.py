@@ -91,6 +91,9 @@ class Request:
     stream_id: str | None = None
     """Of its WebSocket, whose requests share a request id and are distinguished by `seq`."""
 
+    may_explore: bool = True
+    """Whether its key may ask for exploring actions."""
+
     obs: Any = None
     explore: bool = False
     seed: int | None = None

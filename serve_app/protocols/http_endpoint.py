@@ -39,6 +39,7 @@ from rlservo.serve_app.protocols.http_errors import (
 from rlservo.serve_app.server.access_checks import (
     HEADERS,
     LABEL,
+    MAY_EXPLORE,
     PATH,
     REPLY_HEADERS,
     REQUEST_ID,
@@ -104,11 +105,12 @@ class PolicyApp(FastAPI):
             await self._answer_by_fastapi(found, path, headers, scope, receive, send)
             return
         try:
-            self._check(found, path, headers, scope)
+            key = self._check(found, path, headers, scope)
         except RlservoError as error:
             await self._refuse(scope, headers, receive, send, error)
             return
         scope["path_params"] = found.params
+        scope[MAY_EXPLORE] = key is None or key.may_explore
         await found.route.app(scope, receive, send)
 
     async def _answer_by_fastapi(
@@ -207,6 +209,7 @@ class HttpEndpoint:
             headers=headers,
             connection=client if (client := scope.get("client")) is not None and client[1] else None,  # a proxy's has 0
             has_hung_up=partial(has_hung_up, receive),
+            may_explore=scope[MAY_EXPLORE],
         )
         status = 200
         try:

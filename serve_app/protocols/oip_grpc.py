@@ -141,6 +141,7 @@ class Grpc:
                 )
                 try:
                     key.check()
+                    request.may_explore = key.may_explore
                 except RlservoError as error:
                     peer = context.peer()
                     handler.record_failure(request, error.code, error.message, peer=peer)
@@ -182,7 +183,9 @@ class Grpc:
             headers=headers,
         )
         try:
-            authorize(self._handler.keys, presented_key(headers), Access.open if method in OPEN else Access.act)
+            access = Access.open if method in OPEN else Access.act
+            key = authorize(self._handler.keys, presented_key(headers), access)
+            request.may_explore = key is None or key.may_explore
         except RlservoError as error:
             peer = context.peer()
             self._handler.record_failure(request, error.code, error.message, peer=peer)

@@ -175,6 +175,7 @@ class _Conversation:
         try:
             try:
                 self._key.check()
+                request.may_explore = self._key.may_explore
             except RlservoError as error:
                 handler.record_failure(request, error.code, error.message)
                 raise

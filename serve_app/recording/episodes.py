@@ -192,18 +192,30 @@ class Episode:
 
 def episodes(recording: Recording) -> Iterator[Episode]:
     """Yield every episode of a recording as it ends, then those that did not."""
-    opened: OrderedDict[tuple[int, str], Episode] = OrderedDict()
+    assembler = EpisodeAssembler()
     for entry in recording.entries():
+        yield from assembler.add(entry)
+    yield from assembler.opened.values()
+
+
+class EpisodeAssembler:
+    """Puts the messages of one writer together to episodes."""
+
+    def __init__(self) -> None:
+        self.opened: OrderedDict[tuple[int, str], Episode] = OrderedDict()
+        """The episodes that have not ended, by policy and id; the longest silent come first."""
+
+    def add(self, entry: Entry) -> Iterator[Episode]:
+        """Take the next message and yield the episodes, or pieces of one, that end with it."""
         key = (id(entry.policy), str(entry.fields.get("episode", "")))
         if entry.kind == "decision":
-            yield from _add_decision(opened, key, entry)
-        elif (episode := opened.get(key)) is not None:
+            yield from _add_decision(self.opened, key, entry)
+        elif (episode := self.opened.get(key)) is not None:
             _add_outcome(episode, entry.fields)
             if episode.ended:
-                yield opened.pop(key)
-        if len(opened) > MOST_OPEN:
-            yield opened.popitem(last=False)[1]
-    yield from opened.values()
+                yield self.opened.pop(key)
+        if len(self.opened) > MOST_OPEN:
+            yield self.opened.popitem(last=False)[1]
 
 
 def _add_decision(

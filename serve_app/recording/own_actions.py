@@ -43,7 +43,7 @@ def own_actions(episode: Episode) -> OwnActions:
     if not is_invertible(contract):
         return OwnActions(episode.own_action, recorded, recorded, np.zeros_like(recorded))
     for name, leaf in specs.items():
-        recorded &= _is_sent_as(to_sent(episode.own_action[name], transform, leaf), episode.executed[name], leaf)
+        recorded &= is_sent_as(to_sent(episode.own_action[name], transform, leaf), episode.executed[name], leaf)
     leaves: Columns = {}
     clipped = np.zeros(len(episode), np.bool_)
     for name, leaf in specs.items():
@@ -82,7 +82,7 @@ def modes(episode: Episode) -> OwnActions:
     return OwnActions(leaves, known, own.recorded | drawn, own.clipped & ~drawn)
 
 
-def _is_sent_as(sent: NDArray[Any], executed: NDArray[Any], leaf: LeafSpec) -> NDArray[np.bool_]:
+def is_sent_as(sent: NDArray[Any], executed: NDArray[Any], leaf: LeafSpec) -> NDArray[np.bool_]:
     """Return the rows in which what would be sent is what was executed, but for float32: no step limit was between."""
     slack: NDArray[np.float64] | float = 0.0
     if isinstance(leaf, BoxSpec):

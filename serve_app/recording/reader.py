@@ -56,6 +56,8 @@ class FileFacts:
     being_written: bool = False
     damage: str | None = None
     """Damage beyond a missing end."""
+    position: int = 0
+    """[bytes] How far it was read: a reader goes on from here when its writer has added to it."""
     messages: int = 0
     dropped: int = 0
     clock_jumps: int = 0
@@ -91,7 +93,7 @@ class Recording:
         for path in self.paths:
             facts = FileFacts(path, being_written=is_being_written(path))
             self.files.append(facts)
-            yield from _FileReader(self, facts).entries()
+            yield from FileReader(self, facts).entries()
 
     def known(self, policy: PolicyFormat) -> PolicyFormat:
         """Return the one object that stands for this policy."""
@@ -103,7 +105,7 @@ class Recording:
 
 
 def read_records(facts: FileFacts) -> Iterator[McapRecord]:
-    """Yield what is in the file `facts.path`, chunks taken apart, to its last whole chunk.
+    """Yield what is in the file `facts.path` from `facts.position`, chunks taken apart, to its last whole chunk.
 
     Sets `whole` and `damage` at the end. Raises RecordingError if it is not an MCAP file.
     """
@@ -116,11 +118,16 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
 
     with path.open("rb") as stream:
         try:
-            for record in StreamReader(stream, emit_chunks=True, record_size_limit=LARGEST_RECORD).records:
+            stream.seek(facts.position)
+            reader = StreamReader(
+                stream, skip_magic=facts.position > 0, emit_chunks=True, record_size_limit=LARGEST_RECORD
+            )
+            for record in reader.records:
                 if isinstance(record, Chunk):
                     yield from breakup_chunk(record, validate_crc=True)
                 else:
                     yield record
+                facts.position = stream.tell()
             facts.whole = True  # the footer and the closing magic were there
         except InvalidMagic:
             if stream.tell() <= len(b"\x89MCAP0\r\n"):
@@ -136,8 +143,8 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
             damaged(error)
 
 
-class _FileReader:
-    """One pass over one file."""
+class FileReader:
+    """One pass over one file, in as many calls of `entries` as its writer adds to it."""
 
     def __init__(self, recording: Recording, facts: FileFacts) -> None:
         self._recording = recording
@@ -148,6 +155,7 @@ class _FileReader:
         self._offset_ns: int | None = None
 
     def entries(self) -> Iterator[Entry]:
+        """Yield what the file holds beyond what was yielded before. Raises RecordingError."""
         for record in read_records(self._facts):
             try:
                 entry = self._take(record)

@@ -34,6 +34,10 @@ class PolicyOptions(BaseModel):
     formed in another order, so the last bits of an action may differ. Computed one by one all the same: policies with a
     memory or a `max_action_step`, and requests that explore or say anything of an episode."""
 
+    explore: bool = True
+    """Whether clients may ask for exploring actions, where their key lets them. A robot that must not explore asks for
+    none; `false` refuses them to all."""
+
     record: bool = True
     """Whether a server that records (`--record`) also records this policy."""
 

@@ -426,6 +426,8 @@ class Policy(Closeable):
             raise RequestError(
                 f"policy '{self._contract.name}' has no action distribution and cannot explore: leave 'explore' out"
             )
+        if not self.options.explore:
+            raise RequestError(f"policy '{self._contract.name}' is not to explore on this server: leave 'explore' out")
         return distribution
 
     def _sample(self, inputs: NDArray[Any], seed: int | None) -> dict[str, NDArray[Any]]:

@@ -42,6 +42,7 @@ HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
 LABEL = LABEL_HEADER.encode()
 HEADERS = "rlservo.headers"  # in a connection's scope: what `fold_headers` gave
+MAY_EXPLORE = "rlservo.may_explore"  # in a connection's scope: whether its key may ask for exploring actions
 REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, besides the protocol's own
 ANY_HOST = "*"
 
@@ -148,6 +149,11 @@ class StreamKey:
             self._changes = changes
         elif self._key is not None and self._key.limit is not None:
             self._keys.limits.spend(self._key, self._key.limit)
+
+    @property
+    def may_explore(self) -> bool:
+        """Whether the key that was checked last may ask for exploring actions."""
+        return self._key is None or self._key.may_explore
 
 
 class AccessChecks:

@@ -3,7 +3,7 @@
 A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
 key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
 
-    <label> <act|admin> sha256:<64 hexadecimal digits> [rate=<requests a second> [burst=<requests at once>]]
+    <label> <act|explore|admin> sha256:<64 hexadecimal digits> [rate=<requests a second> [burst=<requests at once>]]
 
 `rlservo key LABEL` makes a key and its line.
 """
@@ -30,7 +30,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.loopback import is_loopback
 
 LINE = re.compile(
-    r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|admin)\s+sha256:(?P<digest>[0-9a-f]{64})"
+    r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|explore|admin)\s+sha256:(?P<digest>[0-9a-f]{64})"
     r"(?:\s+rate=(?P<rate>[0-9]{1,6}(?:\.[0-9]{1,3})?)(?:\s+burst=(?P<burst>[1-9][0-9]{0,5}))?)?"
 )
 KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets recognise it
@@ -44,9 +44,11 @@ Endpoint = TypeVar("Endpoint")
 
 
 class Role(str, Enum):
-    """Role of a key; an admin key may also do all that an act key may."""
+    """Role of a key; each may also do all that the ones before it may."""
 
     act = "act"
+    explore = "explore"
+    """Also for actions that are drawn from the policy's distribution, which `rlservo learn` learns from."""
     admin = "admin"
 
 
@@ -108,6 +110,10 @@ class Key:
     digest: bytes
     limit: RateLimit | None = None
 
+    @property
+    def may_explore(self) -> bool:
+        return self.role is not Role.act
+
 
 @dataclass(frozen=True)
 class Keys:
@@ -131,7 +137,7 @@ class Keys:
             match = LINE.fullmatch(line)
             if match is None:  # the line is not shown: it may be a key by mistake
                 raise UsageError(
-                    f"{where}: expected '<label> <act|admin> sha256:<64 hexadecimal digits>', as "
+                    f"{where}: expected '<label> <act|explore|admin> sha256:<64 hexadecimal digits>', as "
                     "'rlservo key LABEL' makes it, and after it 'rate=<requests a second> burst=<requests>' or nothing"
                 )
             try:
@@ -152,12 +158,15 @@ def without_keys(text: str) -> str:
     return A_KEY.sub(f"{KEY_PREFIX}...", text)
 
 
-def new_key(label: str, *, admin: bool = False, rate: float | None = None, burst: int | None = None) -> tuple[str, str]:
+def new_key(
+    label: str, *, admin: bool = False, explore: bool = False, rate: float | None = None, burst: int | None = None
+) -> tuple[str, str]:
     """Return (the key, for the client alone; its line, for the server). Raises UsageError."""
     if burst is not None and rate is None:
         raise UsageError("--burst needs a rate: also give the requests per second")
+    role = "admin" if admin else "explore" if explore else "act"
     key = KEY_PREFIX + secrets.token_urlsafe(KEY_BYTES)
-    line = f"{label} {'admin' if admin else 'act'} sha256:{hashlib.sha256(key.encode()).hexdigest()}"
+    line = f"{label} {role} sha256:{hashlib.sha256(key.encode()).hexdigest()}"
     if LINE.fullmatch(line) is None:
         raise UsageError(f"label {label[:80]!r}: expected 1 to 64 letters, digits, '.', '_' and '-'")
     line += "" if rate is None else f" rate={rate:.3f}".rstrip("0").rstrip(".")

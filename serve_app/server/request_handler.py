@@ -20,6 +20,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from rlservo.export.contract.errors import (
+    ForbiddenError,
     InternalError,
     LateError,
     ObservationError,
@@ -52,6 +53,7 @@ logger = logging.getLogger(__name__)
 
 STRICTER = "stricter-than-production"
 """Counted for `bad-observation` where the version that production leads to takes the observation."""
+NO_EXPLORING = "this API key may not ask for exploring actions: leave 'explore' out, or use a key of the role 'explore'"
 BUG = "the server failed on this request; its log says how"
 
 StoreProvider = Callable[[], PolicyStore | None]
@@ -229,6 +231,8 @@ class RequestHandler:
             self._admit(request)
             self.store()  # not ready comes before any fault of the request
             codec.parse(request, content)
+            if request.explore and not request.may_explore:
+                raise ForbiddenError(NO_EXPLORING)
             if request.label is not None or request.episode is not None:
                 _check_names(request)
             if request.non_finite:

@@ -71,7 +71,8 @@ class ServerSettings(BaseModel):
     """[s] A stream (WebSocket, gRPC) that was silent for this long is closed."""
 
     api_keys_file: str | None = None
-    """File of the API keys' hashes, a line each: `<label> <act|admin> sha256:<hash>`; `rlservo key` makes them."""
+    """File of the API keys' hashes, a line each: `<label> <act|explore|admin> sha256:<hash>`; `rlservo key` makes
+    them."""
 
     api_keys: str = Field("", repr=False)
     """The same lines, separated by commas, if a variable is easier to set than a file."""

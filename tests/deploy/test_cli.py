@@ -331,6 +331,7 @@ def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
     assert found is not None and (found.label, found.role) == ("operator", Role.admin)
     plain = rlservo_here("key", "cell-7").stdout.split("\n")
     assert plain[0].startswith("rlservo_") and plain[1].startswith("cell-7 act sha256:")
+    assert rlservo_here("key", "cell-8", "--explore").stdout.split("\n")[1].startswith("cell-8 explore sha256:")
     refused(rlservo_here("key", "two words"), 2, "label 'two words': expected 1 to 64 letters")
 
 

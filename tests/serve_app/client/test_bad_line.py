@@ -42,7 +42,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:
 
 ROOT = Path(__file__).resolve().parents[3]
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
-KEY, LINE = new_key("robot")
+KEY, LINE = new_key("robot", explore=True)
 Serve = Callable[[Any], AbstractContextManager[int]]
 Client = PolicyClient | StreamClient
 KINDS = pytest.mark.parametrize("kind", [PolicyClient, StreamClient])

@@ -34,6 +34,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:
 
 CELL, CELL_LINE = new_key("cell-7")
 OTHER, OTHER_LINE = new_key("cell-8")
+EXPLORER, EXPLORER_LINE = new_key("trainee", explore=True)
 ADMIN, ADMIN_LINE = new_key("operator", admin=True)
 OBS = [0.1] * 27
 ACT = ("POST", "/v1/policies/ur5/act", {"obs": OBS})
@@ -68,7 +69,7 @@ def store(ur5: Path) -> PolicyStore:
 @pytest.fixture(scope="module")
 def port(store: PolicyStore, served: Serve, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     file = tmp_path_factory.mktemp("keys") / "keys"
-    file.write_text(f"# robots\n{CELL_LINE}\n\n{ADMIN_LINE}\n")
+    file.write_text(f"# robots\n{CELL_LINE}\n\n{ADMIN_LINE}\n{EXPLORER_LINE}\n")
     settings = ServerSettings(api_keys_file=str(file), api_keys=OTHER_LINE)
     with served(create_app(lambda: store, settings)) as port:
         yield port
@@ -145,6 +146,29 @@ def test_a_known_key_gets_through_however_it_is_sent(port: int, key: str) -> Non
         assert stream(port, **headers)["policy"] == "ur5"
 
 
+EXPLORE = ("POST", ACT[1], {**ACT[2], "explore": True})
+EXPLORE_OIP = ("POST", INFER[1], {**INFER[2], "parameters": {"explore": True}})
+
+
+def test_only_a_key_that_says_so_explores_in_every_protocol(port: int, store: PolicyStore, served: Serve) -> None:
+    def explores(key: str) -> bool:
+        with websockets.sync.client.connect(
+            f"ws://127.0.0.1:{port}/", additional_headers={"authorization": f"Bearer {key}"}
+        ) as connection:
+            connection.recv()
+            connection.send(msgpack.packb({"obs": OBS, "explore": True}))
+            return isinstance(connection.recv(), bytes)
+
+    for key, status in ((CELL, 403), (OTHER, 403), (EXPLORER, 200), (ADMIN, 200)):
+        for request in (EXPLORE, EXPLORE_OIP):
+            found, _, reply = call(port, *request, authorization=f"Bearer {key}")
+            assert found == status, reply
+            assert status == 200 or "may not ask for exploring actions" in reply["error"]
+        assert explores(key) is (status == 200)
+    with served(create_app(lambda: store, ServerSettings())) as open_port:  # without keys all may
+        assert call(open_port, *EXPLORE)[0] == 200
+
+
 def test_probes_and_documentation_need_no_key(port: int) -> None:
     for path in (
         "/healthz",
@@ -161,10 +185,11 @@ def test_administration_wants_an_admin_key_even_where_no_key_is_asked_for(
     ur5: Path, controlled: Callable[..., AbstractContextManager[PlanFollower]], served: Serve
 ) -> None:
     with controlled(ur5) as control:
-        lines = f"{CELL_LINE},{ADMIN_LINE}"
+        lines = f"{CELL_LINE},{ADMIN_LINE},{EXPLORER_LINE}"
         with served(create_app(lambda: control.store, ServerSettings(api_keys=lines), control=control)) as port:
             status, _, reply = call(port, *LOAD, authorization=f"Bearer {CELL}")
             assert (status, reply["code"]) == (403, "forbidden") and "'cell-7'" in reply["error"]
+            assert call(port, *LOAD, authorization=f"Bearer {EXPLORER}")[0] == 403
             assert call(port, *LOAD)[0] == call(port, *LOAD, authorization="Bearer wrong")[0] == 401
             assert call(port, *LOAD, authorization=f"Bearer {ADMIN}")[0] in (200, 409)
         with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:

@@ -1,0 +1,137 @@
+"""Admission of recorded episodes to learning: of a known version, whole, explored, and what the contract allows.
+
+What is not admitted is dropped with a reason, and counted by it. Nothing a client sends can pass for an action of the
+policy's: the server records what it drew, and the graph and contract it drew from must be those that this run made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.export.contract.action_transform import to_sent, transform_of
+from rlservo.export.contract.errors import UsageError, first_line
+from rlservo.export.contract.spaces import leaf_specs
+from rlservo.serve_app.learning.rllib_episodes import row_of, why_not_whole, why_without_reward
+from rlservo.serve_app.recording.episodes import Columns, Episode
+from rlservo.serve_app.recording.own_actions import is_sent_as
+
+LOGP_TOLERANCE = 1e-4
+"""Of a recorded log-probability from that of its own distribution: both come from the same recorded float32."""
+
+Reward: TypeAlias = Callable[[Any, Any, Any], float]
+"""The reward of an action: `reward(obs, action, next_obs)`, each in its space's own form."""
+
+
+@dataclass(frozen=True)
+class KnownVersion:
+    """A version that this run has made, by what a server's recording says of it."""
+
+    version: str
+    graph_sha256: str
+    contract_sha256: str
+
+
+@dataclass(frozen=True)
+class Admitted:
+    """An episode to learn from."""
+
+    episode: Episode
+    version: KnownVersion
+    age: int
+    """How many versions have come after the one that acted."""
+    rewards: NDArray[np.float64]
+
+
+class Admission:
+    """Decides about one episode after the other."""
+
+    def __init__(self, policy: str, *, max_age: int, reward: Reward | None = None) -> None:
+        """`reward` stands in for what clients say that each action brought."""
+        self._policy, self._max_age, self._reward = policy, max_age, reward
+
+    def judge(self, episode: Episode, versions: Sequence[KnownVersion]) -> Admitted | str | None:
+        """Return the episode to learn from, or why not; None where it is another policy's. `versions`: newest last."""
+        contract = episode.policy.contract
+        if contract.name != self._policy:
+            return None
+        place = next((i for i, known in enumerate(versions) if known.version == contract.version), None)
+        if place is None:
+            return "of a version that this run has not made"
+        known, age = versions[place], len(versions) - 1 - place
+        if (episode.policy.graph_hash, episode.policy.contract_hash) != (known.graph_sha256, known.contract_sha256):
+            return "of another graph or contract than the version's"
+        if age > self._max_age:
+            return "of a version that is too old"
+        if (reason := why_not_whole(episode) or _why_not_drawn(episode)) is not None:
+            return reason
+        rewards = episode.reward if self._reward is None else _rewards(episode, self._reward)
+        reason = why_without_reward(episode, rewards)
+        return Admitted(episode, known, age, rewards) if reason is None else reason
+
+
+def _why_not_drawn(episode: Episode) -> str | None:
+    """Return what makes an episode's actions other than the policy's own draws, from observations that it takes."""
+    if not episode.explored.all():
+        return "in which not every action explored"
+    if not episode.acted.all() or episode.fell_back.any():
+        return "in which a fallback acted"
+    seen = [*episode.obs.values(), *(() if episode.final_obs is None else episode.final_obs.values())]
+    if not all(np.isfinite(leaf).all() for leaf in seen):
+        return "with an observation that is not finite"
+    if not np.isfinite(episode.logp).all():
+        return "without every log-probability"
+    logp = episode.policy.log_probability(episode.dist_inputs, episode.own_action)
+    if logp is None or not (np.abs(logp - episode.logp) <= LOGP_TOLERANCE * np.maximum(1.0, np.abs(logp))).all():
+        return "whose log-probabilities are not those of their distributions"
+    return _why_not_sent(episode)
+
+
+def _why_not_sent(episode: Episode) -> str | None:
+    """Return what is wrong with the actions that were sent. A limit on the step may have changed them: it is the
+    environment's part, as clipping is, and the own action is learned.
+    """
+    contract = episode.policy.contract
+    transform, is_limited = transform_of(contract), "max_action_step" in episode.policy.options
+    for name, leaf in leaf_specs(contract.action_space, "action").items():
+        sent = episode.action[name]
+        low, high = leaf.bounds()
+        if not ((sent >= low.astype(sent.dtype)) & (sent <= high.astype(sent.dtype))).all():
+            return "with an action outside the contract's bounds"
+        if not is_limited and not is_sent_as(to_sent(episode.own_action[name], transform, leaf), sent, leaf).all():
+            return "whose actions are not what the policy drew"
+    return None
+
+
+def _rewards(episode: Episode, reward: Reward) -> NDArray[np.float64]:
+    """Return what each action brought by the user's function; the last one needs the observation after it."""
+    contract = episode.policy.contract
+    final: Columns | None = episode.final_obs
+    if final is None:
+        return np.full(len(episode), np.nan)
+    seen = [row_of(contract.observation_space, episode.obs, row, "obs") for row in range(len(episode))]
+    seen.append(row_of(contract.observation_space, final, 0, "obs"))
+    actions = [row_of(contract.action_space, episode.action, row, "action") for row in range(len(episode))]
+    try:
+        return np.array(
+            [float(reward(seen[row], action, seen[row + 1])) for row, action in enumerate(actions)], np.float64
+        )
+    except Exception as error:  # the user's own code
+        raise UsageError(f"the reward function failed: {first_line(error)}") from error
+
+
+def reward_of(source: str, name: str) -> Reward:
+    """Return the function `reward` of a Python file's text. Raises UsageError where there is none."""
+    namespace: dict[str, Any] = {"__name__": "rlservo_reward"}
+    try:
+        exec(compile(source, name, "exec"), namespace)
+    except Exception as error:
+        raise UsageError(f"--reward {name} cannot be loaded: {first_line(error)}") from error
+    if not callable(reward := namespace.get("reward")):
+        raise UsageError(f"--reward {name}: expected a function reward(obs, action, next_obs) in it")
+    found: Reward = reward
+    return found

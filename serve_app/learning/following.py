@@ -1,0 +1,79 @@
+"""Recordings followed while servers write them: each episode once, as soon as it has ended.
+
+Every poll reads what was added to the files since the last one, to the last whole chunk. A file that cannot be read is
+left out with one sentence, and the others go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.recording.episodes import Episode, EpisodeAssembler
+from rlservo.serve_app.recording.reader import FileFacts, FileReader, Recording, RecordingError
+from rlservo.serve_app.recording.recorder import FILE_NAME, SUFFIX
+
+
+@dataclass(frozen=True)
+class Ended:
+    """An episode that has ended, or a piece that no more will come of, and its name in the learner's books."""
+
+    file: str
+    """The file that holds its end."""
+    key: str
+    """Its id and the time of its first decision: robots may use an id again."""
+    episode: Episode
+
+
+class FollowedRecordings:
+    """Folders in which servers record."""
+
+    def __init__(self, folders: Sequence[Path], notify: Callable[[str], object]) -> None:
+        """`notify` gets one sentence for each file that cannot be read. Raises UsageError for what is no folder."""
+        for folder in folders:
+            if not folder.is_dir():
+                raise UsageError(f"--recordings {folder}: expected the folder in which a server records (--record)")
+        self._folders = [folder.absolute() for folder in folders]
+        self._notify = notify
+        self._policies = Recording([])  # one object for the same policy of several files
+        self._files: dict[Path, tuple[FileFacts, FileReader, int]] = {}
+        self._writers: dict[str, EpisodeAssembler] = {}
+
+    def names(self) -> set[str]:
+        """Return the names of the files that are there."""
+        return {str(path) for path in self._paths()}
+
+    def poll(self) -> Iterator[Ended]:
+        """Yield the episodes that have ended since the last poll."""
+        for path in self._paths():
+            facts, reader, size = self._files.get(path) or self._open(path)
+            try:
+                now = path.stat().st_size
+            except FileNotFoundError:  # the oldest files are deleted while servers record
+                continue
+            if facts.whole or facts.damage is not None or now == size:
+                continue
+            self._files[path] = facts, reader, now
+            assembler = self._writers.setdefault(_writer_of(path), EpisodeAssembler())
+            try:
+                for entry in reader.entries():
+                    for episode in assembler.add(entry):
+                        yield Ended(str(path), f"{episode.id}@{episode.wall_ns[0]}", episode)
+            except (RecordingError, OSError) as error:
+                facts.damage = str(error)
+            if facts.damage is not None:
+                self._notify(f"{path} is not read any further: {facts.damage}")
+
+    def _open(self, path: Path) -> tuple[FileFacts, FileReader, int]:
+        facts = FileFacts(path)
+        return facts, FileReader(self._policies, facts), 0
+
+    def _paths(self) -> list[Path]:
+        return [path for folder in self._folders for path in sorted(folder.glob(f"*{SUFFIX}"))]
+
+
+def _writer_of(path: Path) -> str:
+    """Return what the files of one process have in common: an episode may go on in its next file."""
+    return str(path.with_name(path.name.rpartition("-")[0])) if FILE_NAME.match(path.name) else str(path)

@@ -1,0 +1,125 @@
+"""Folder of an online learning: its versions, what it has used, and its lock. Whatever ends it, it can go on.
+
+`learn.json` is replaced at once, and names the newest version that was made, proven and published. What was learned
+after it is learned again, from the same episodes: those count as used only from the version on that holds them.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.interface import Closeable
+from rlservo.serve_app.learning.admission import KnownVersion
+
+STATE_FILE, LOCK_FILE, REWARD_FILE = "learn.json", ".lock", "reward.py"
+
+
+@dataclass
+class State:
+    """What a run has come to with its newest version."""
+
+    terms: dict[str, Any]
+    """What may not change between two starts of a run."""
+    versions: list[KnownVersion] = field(default_factory=list)
+    """In their order, the newest last."""
+    updates: int = 0
+    episodes: int = 0
+    steps: int = 0
+    used: dict[str, list[str]] = field(default_factory=dict)
+    """The episodes that were learned from or dropped, by the file with their end."""
+    dropped: Counter[str] = field(default_factory=Counter)
+    """Episodes by the reason why nothing was learned from them."""
+    refused: int = 0
+    """Versions that the gate refused."""
+
+
+class RunFolder(Closeable):
+    """One run's folder, held by one process."""
+
+    def __init__(self, path: Path, terms: dict[str, Any], reward_source: str | None) -> None:
+        """Make the folder, or go on with the run in it. Raises UsageError where another holds it, or of other terms."""
+        self.path = path.absolute()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = os.open(self.path / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise UsageError(f"--out {path} cannot be written: {error.strerror}") from error
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise UsageError(f"--out {path}: another process learns in it") from None
+        try:
+            self.state = self._read(terms, reward_source)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def is_new(self) -> bool:
+        return not self.state.versions
+
+    @property
+    def bundles(self) -> Path:
+        """The folder of the bundles, `<policy>/<version>`."""
+        return self.path / "bundles"
+
+    def checkpoint(self, version: str) -> Path:
+        """Return the checkpoint that a version was exported from."""
+        return self.path / "checkpoints" / version
+
+    def begin(self, name: str, version: str) -> Path:
+        """Return the folder for a new version's checkpoint, and remove what a killed process left of it."""
+        shutil.rmtree(self.checkpoint(version), ignore_errors=True)
+        shutil.rmtree(self.bundles / name / version, ignore_errors=True)
+        self.checkpoint(version).parent.mkdir(parents=True, exist_ok=True)
+        return self.checkpoint(version)
+
+    def commit(self, present: Collection[str]) -> None:
+        """Write the state; what it says of files that are not `present` any more is dropped."""
+        state = self.state
+        state.used = {file: keys for file, keys in state.used.items() if file in present}
+        part = self.path / f"{STATE_FILE}.part"
+        with part.open("w") as stream:
+            json.dump({**vars(state), "versions": [asdict(known) for known in state.versions]}, stream, indent=1)
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(self.path / STATE_FILE)
+
+    def close(self) -> None:
+        """Let another process go on."""
+        os.close(self._lock)
+
+    def _read(self, terms: dict[str, Any], reward_source: str | None) -> State:
+        file, shown = self.path / STATE_FILE, self.path / REWARD_FILE
+        if not file.exists():
+            others = [entry.name for entry in self.path.iterdir() if entry.name not in (LOCK_FILE, REWARD_FILE)]
+            if set(others) - {"bundles", "checkpoints", f"{STATE_FILE}.part"}:  # of a run killed before its first
+                raise UsageError(f"--out {self.path} holds {others[0]}: expected a new folder, or that of a run")
+            if reward_source is not None:
+                shown.write_text(reward_source)
+            return State(terms)
+        try:
+            document = json.loads(file.read_text())
+            versions = [KnownVersion(**known) for known in document.pop("versions")]
+            state = State(versions=versions, dropped=Counter(document.pop("dropped")), **document)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise UsageError(f"{file} cannot be read ({error!r}): give a new --out") from None
+        changed = next((name for name in terms if state.terms.get(name) != terms[name]), None)
+        if changed is not None:
+            raise UsageError(
+                f"--out {self.path} is a run with {changed} {state.terms.get(changed)!r}, not {terms[changed]!r}: "
+                "give the same again, or a new --out"
+            )
+        if (shown.read_text() if shown.exists() else None) != reward_source:
+            raise UsageError(f"--reward is not what this run began with ({shown}): give the same, or a new --out")
+        return state

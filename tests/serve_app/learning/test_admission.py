@@ -1,0 +1,135 @@
+"""Admission of recorded episodes to learning: one that fits, and everything that does not, by its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.learning.admission import Admission, Admitted, KnownVersion, reward_of
+from rlservo.serve_app.recording.episodes import Episode, episodes
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.recording.recorded_policy import WithRecording
+from rlservo.serve_app.runtime.policy import Policy
+
+OBS = np.linspace(-0.1, 0.1, 27, dtype=np.float32)
+OLD = KnownVersion("7", "0" * 64, "0" * 64)
+
+
+def recorded(bundle: Path, file: Path, play: Callable[[WithRecording], None] | None = None) -> Episode:
+    with WithRecording(Policy.load(bundle), file) as policy:
+        if play is not None:
+            play(policy)
+        else:
+            for step in range(4):
+                policy.act(OBS, explore=True, seed=step)
+                policy.outcome(0.5, terminated=step == 3, final_obs=OBS if step == 3 else None)
+    (episode,) = episodes(Recording(file))
+    return episode
+
+
+def known(episode: Episode) -> KnownVersion:
+    policy = episode.policy
+    return KnownVersion(policy.contract.version, policy.graph_hash, policy.contract_hash)
+
+
+def test_a_whole_explored_episode_of_a_known_version_is_admitted(ur5: Path, tmp_path: Path) -> None:
+    episode = recorded(ur5, tmp_path / "run.mcap")
+    admission = Admission("ur5", max_age=1)
+    admitted = admission.judge(episode, [known(episode), OLD])
+    assert isinstance(admitted, Admitted)
+    assert admitted.age == 1 and admitted.version == known(episode) and admitted.rewards.tolist() == [0.5] * 4
+    assert admission.judge(episode, [known(episode), OLD, OLD]) == "of a version that is too old"
+    assert admission.judge(episode, [OLD]) == "of a version that this run has not made"
+    foreign = KnownVersion(known(episode).version, "0" * 64, known(episode).contract_sha256)
+    assert admission.judge(episode, [foreign]) == "of another graph or contract than the version's"
+    assert Admission("another", max_age=1).judge(episode, [known(episode)]) is None
+
+
+def acted(explore: list[bool], rewards: list[float], *, final: bool = True) -> Callable[[WithRecording], None]:
+    def play(policy: WithRecording) -> None:
+        for step, (explores, reward) in enumerate(zip(explore, rewards, strict=True)):
+            policy.act(OBS, explore=explores)
+            last = step == len(explore) - 1
+            policy.outcome(reward, truncated=last, final_obs=OBS if last and final else None)
+
+    return play
+
+
+def fell_back(policy: WithRecording) -> None:
+    policy.act(OBS, explore=True)
+    policy.set_last_action(np.zeros(6, np.float32))
+    policy.outcome(1.0, terminated=True)
+
+
+@pytest.mark.parametrize(
+    ("play", "reason"),
+    [
+        (acted([True, False, True], [1.0] * 3), "in which not every action explored"),
+        (acted([True, True], [1.0, float("nan")]), "without every reward"),
+        (acted([True, True], [1.0, float("inf")]), "without every reward"),
+        (acted([True], [1.0], final=False), "cut off, without the observation after the last action"),
+        (fell_back, "in which a fallback acted"),
+    ],
+)
+def test_what_a_robot_did_otherwise_is_dropped(
+    ur5: Path, tmp_path: Path, play: Callable[[WithRecording], None], reason: str
+) -> None:
+    episode = recorded(ur5, tmp_path / "run.mcap", play)
+    assert Admission("ur5", max_age=1).judge(episode, [known(episode)]) == reason
+
+
+def change_logp(decision: dict[str, Any]) -> None:
+    decision["logp"] += 0.01
+
+
+def change_action(decision: dict[str, Any]) -> None:
+    decision["action"] = dict.fromkeys(decision["action"], 0.25)
+
+
+def leave_the_bounds(decision: dict[str, Any]) -> None:
+    decision["action"] = dict.fromkeys(decision["action"], 3.0)
+
+
+def spoil_the_observation(decision: dict[str, Any]) -> None:
+    decision["obs"] = dict.fromkeys(decision["obs"])
+
+
+def drop(decision: dict[str, Any]) -> None:
+    decision["step"] += 1
+
+
+@pytest.mark.parametrize(
+    ("forge", "reason"),
+    [
+        (change_logp, "whose log-probabilities are not those of their distributions"),
+        (change_action, "whose actions are not what the policy drew"),
+        (leave_the_bounds, "with an action outside the contract's bounds"),
+        (spoil_the_observation, "with an observation that is not finite"),
+        (drop, "without their beginning or with a gap"),
+    ],
+)
+def test_a_forged_decision_is_dropped_with_its_episode(
+    ur5: Path, tmp_path: Path, forge: Callable[[dict[str, Any]], None], reason: str
+) -> None:
+    episode = recorded(ur5, tmp_path / "run.mcap")
+    forge(episode._decisions[3])
+    assert Admission("ur5", max_age=0).judge(episode, [known(episode)]) == reason
+
+
+def test_a_reward_function_stands_in_for_what_clients_say(ur5: Path, tmp_path: Path) -> None:
+    episode = recorded(ur5, tmp_path / "run.mcap", acted([True, True], [float("nan")] * 2))
+    reward = reward_of("def reward(obs, action, next_obs):\n    return float(next_obs[0] - obs[1])\n", "r.py")
+    admitted = Admission("ur5", max_age=0, reward=reward).judge(episode, [known(episode)])
+    assert isinstance(admitted, Admitted)
+    assert admitted.rewards == pytest.approx([OBS[0] - OBS[1]] * 2)
+    fails = reward_of("def reward(obs, action, next_obs):\n    return obs['x']\n", "r.py")
+    with pytest.raises(UsageError, match="the reward function failed"):
+        Admission("ur5", max_age=0, reward=fails).judge(episode, [known(episode)])
+    for source in ("x = 1", "def reward(:"):
+        with pytest.raises(UsageError, match=r"--reward r\.py"):
+            reward_of(source, "r.py")

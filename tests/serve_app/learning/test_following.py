@@ -1,0 +1,82 @@
+"""Recordings followed while they are written."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.learning.following import Ended, FollowedRecordings
+from rlservo.serve_app.recording.recorded_policy import WithRecording
+from rlservo.serve_app.recording.recorder import Recorder
+from rlservo.serve_app.runtime.policy import Policy
+
+OBS = np.zeros(27, np.float32)
+
+
+def act(policy: WithRecording, steps: int, *, ends: bool) -> None:
+    for step in range(steps):
+        policy.act(OBS, explore=True)
+        last = ends and step == steps - 1
+        policy.outcome(1.0, terminated=last, final_obs=OBS if last else None)
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+def polled(followed: FollowedRecordings, count: int) -> list[Ended]:
+    """Poll until so many episodes have come: the writer flushes within a second."""
+    found: list[Ended] = []
+    deadline = time.monotonic() + 60
+    while len(found) < count and time.monotonic() < deadline:
+        found += followed.poll()
+        time.sleep(0.1)
+    return [*found, *followed.poll()]
+
+
+def test_an_episode_comes_once_as_soon_as_it_has_ended(ur5: Path, tmp_path: Path, said: list[str]) -> None:
+    followed = FollowedRecordings([tmp_path], said.append)
+    assert list(followed.poll()) == []
+    with Recorder(tmp_path) as recorder, WithRecording(Policy.load(ur5), recorder) as policy:
+        act(policy, 3, ends=True)
+        policy.reset()
+        act(policy, 2, ends=False)  # goes on below, in a file that was read in between
+        first = polled(followed, 1)
+        act(policy, 4, ends=True)
+        second = polled(followed, 1)
+    assert [len(one.episode) for one in first] == [3] and [len(one.episode) for one in second] == [6]
+    assert second[0].episode.gap is None and second[0].episode.terminated
+    assert first[0].key != second[0].key and followed.names() == {first[0].file}
+    assert list(followed.poll()) == [] and said == []
+
+
+def test_robots_that_use_an_id_again_have_episodes_of_their_own(ur5: Path, tmp_path: Path, said: list[str]) -> None:
+    with Recorder(tmp_path) as one, Recorder(tmp_path) as other:  # two servers, one folder
+        for recorder in (one, other, one):
+            with WithRecording(Policy.load(ur5), recorder) as policy:
+                policy._episode = "cell"
+                act(policy, 2, ends=True)
+    found = polled(FollowedRecordings([tmp_path], said.append), 3)
+    assert len(found) == 3 == len({(each.file, each.key) for each in found})
+    assert [each.episode.gap for each in found] == [None] * 3
+
+
+def test_a_file_that_is_no_recording_is_named_once_and_the_others_are_read(
+    ur5: Path, tmp_path: Path, said: list[str]
+) -> None:
+    (tmp_path / "another.mcap").write_bytes(b"no recording at all, but long enough")
+    with Recorder(tmp_path) as recorder, WithRecording(Policy.load(ur5), recorder) as policy:
+        act(policy, 2, ends=True)
+    followed = FollowedRecordings([tmp_path], said.append)
+    assert len(polled(followed, 1)) == 1
+    assert len(said) == 1 and "another.mcap is no MCAP file" in said[0]
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"--recordings .*nowhere: expected the folder in which a server records"):
+        FollowedRecordings([tmp_path / "nowhere"], str)

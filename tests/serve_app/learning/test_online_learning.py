@@ -1,0 +1,223 @@
+"""Online learning from end to end: robots over HTTP, a server that records, RLlib's learner, the gate, the alias.
+
+The robots act while the learner waits, in its thread, so that every run is the same one.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.rl_module import RLModule
+
+from rlservo.export.contract.errors import ConflictError, UsageError
+from rlservo.export.export_checkpoint import ExportResult
+from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.learning.admission import Admission
+from rlservo.serve_app.learning.following import FollowedRecordings
+from rlservo.serve_app.learning.online import OnlineLearning
+from rlservo.serve_app.learning.release import Release, Target
+from rlservo.serve_app.learning.rllib_episodes import single_agent_episode
+from rlservo.serve_app.learning.rllib_learner import OnlineLearner
+from rlservo.serve_app.learning.run_folder import RunFolder
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.recording.episodes import episodes
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.recording.recorded_policy import WithRecording
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.api_keys import new_key
+from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.plan_follower import PlanFollower
+
+ROBOT, ROBOT_LINE = new_key("robot", explore=True)
+ADMIN, ADMIN_LINE = new_key("boss", admin=True)
+LENGTH, BATCH = 8, 40  # steps of an episode, and of an update
+
+# uvicorn 0.54 picks a protocol that it itself calls deprecated.
+pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+
+
+@dataclass
+class Cell:
+    """A server that records, its robot, and the run that learns from it."""
+
+    url: str
+    folder: Path
+    checkpoint: Path
+    said: list[str] = field(default_factory=list)
+    acted: list[str] = field(default_factory=list)
+    """The version that acted in each episode."""
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+    def play(self, reward: float = 1.0) -> None:
+        """Let the robot have an episode."""
+        with PolicyClient(self.url, "policy", version="learning", api_key=ROBOT, timeout_s=60) as policy:
+            for step in range(LENGTH):
+                policy.act(self._obs(), explore=True)
+                ends = step == LENGTH - 1
+                policy.outcome(reward if ends else 0.0, truncated=ends, final_obs=self._obs() if ends else None)
+            self.acted.append(policy.contract.version)
+        time.sleep(0.2)  # the server's recorder flushes within a second
+
+    def _obs(self) -> NDArray[np.float32]:
+        return self.rng.standard_normal(3).astype(np.float32)
+
+    def learning(self, run: RunFolder, learner: OnlineLearner | None = None, **more: Any) -> OnlineLearning:
+        target = Target("policy", str(self.folder / "policies"), "learning")
+        release = Release(target, run, self.admin, app_dir=self.folder, progress=str)
+        return OnlineLearning(
+            learner or OnlineLearner(self.checkpoint, batch_size=BATCH), run,
+            FollowedRecordings([self.folder / "recorded"], self.said.append), Admission("policy", max_age=1), release,
+            **{"every": 1, "max_age": 1, "say": self.said.append, "progress": str, "sleep": lambda s: self.play()}
+            | more,
+        )  # fmt: skip
+
+    def run_folder(self, name: str = "run") -> RunFolder:
+        return RunFolder(self.folder / name, {"policy": "policy"}, None)
+
+    def admin(self) -> AdminClient:
+        return AdminClient(self.url, api_key=ADMIN)
+
+    def aliases(self) -> dict[str, str]:
+        with self.admin() as client:
+            aliases: dict[str, str] = client.listing()["policies"][0]["aliases"]
+            return aliases
+
+
+@pytest.fixture
+def cell(
+    zoo: Path,
+    exported: Callable[..., ExportResult],
+    controlled: Callable[..., AbstractContextManager[PlanFollower]],
+    served: Callable[[Any], AbstractContextManager[int]],
+    tmp_path: Path,
+) -> Iterator[Cell]:
+    shutil.copytree(exported(zoo / "pendulum").path, tmp_path / "policies" / "policy" / "1")
+    settings = ServerSettings(record=str(tmp_path / "recorded"), api_keys=f"{ROBOT_LINE},{ADMIN_LINE}")
+    with (
+        controlled(tmp_path / "policies") as control,
+        served(create_app(lambda: control.store, settings, control=control)) as port,
+    ):
+        yield Cell(f"http://127.0.0.1:{port}", tmp_path, zoo / "pendulum")
+
+
+def test_robots_train_versions_that_reach_them_by_the_alias(cell: Cell) -> None:
+    with cell.run_folder() as run:
+        cell.learning(run).run(versions=2)
+        first, second, third = (known.version for known in run.state.versions)
+        assert (first, second, third) == ("2", "3", "4")
+        assert cell.aliases() == {"production": "1", "learning": "4"}
+        cell.play()
+    assert cell.acted[0] == "2" and "3" in cell.acted and cell.acted[-1] == "4"
+    graphs = {(cell.folder / "policies/policy" / v / "policy.onnx").read_bytes() for v in (first, second, third)}
+    assert len(graphs) == 3  # it did learn
+    assert "learning goes on" not in "".join(cell.said)
+
+
+def test_poisoned_episodes_teach_nothing_and_stop_nothing(cell: Cell) -> None:
+    rewards = iter([float("nan"), float("inf")] + [1.0] * 50)
+    with cell.run_folder() as run:
+        cell.learning(run, sleep=lambda s: cell.play(next(rewards))).run(versions=1)
+        assert run.state.dropped == {"without every reward": 2}
+        assert run.state.steps == run.state.episodes * LENGTH >= BATCH
+
+
+def test_a_killed_learner_goes_on_and_uses_every_episode_once(cell: Cell) -> None:
+    def kill_after(updates: int) -> Callable[[str], None]:
+        def say(line: str) -> None:
+            cell.said.append(line)
+            if line.startswith(f"update {updates:>4}"):
+                raise KeyboardInterrupt  # between an update and its version
+
+        return say
+
+    with cell.run_folder() as run, pytest.raises(KeyboardInterrupt):
+        cell.learning(run, say=kill_after(2)).run()
+    before = json.loads((cell.folder / "run" / "learn.json").read_text())
+    assert before["updates"] == 1 and [known["version"] for known in before["versions"]] == ["2", "3"]
+    again = [line for line in cell.said if line.startswith("update    2")]
+    with cell.run_folder() as run:
+        cell.learning(run).run(versions=1)
+        state = run.state
+        used = [key for keys in state.used.values() for key in keys]
+        assert (state.updates, len(used), len(set(used))) == (2, state.episodes, state.episodes)
+    # The same episodes from the same weights and filter: the same numbers again.
+    assert [line for line in cell.said if line.startswith("update    2")] == again * 2
+    assert cell.aliases()["learning"] == "4"
+
+
+class BrokenOnce(OnlineLearner):
+    """Its second checkpoint has weights that are not numbers, as after an update that diverged."""
+
+    saved = 0
+
+    def save(self, folder: Path) -> None:
+        super().save(folder)
+        self.saved += 1
+        if self.saved == 2:
+            place = folder / "learner_group" / "learner" / "rl_module" / "default_policy"
+            module = RLModule.from_checkpoint(str(place))
+            with torch.no_grad():
+                for parameter in module.parameters():  # type: ignore[attr-defined]
+                    parameter.fill_(float("nan"))
+            module.save_to_path(str(place))
+
+
+def test_a_version_that_the_gate_refuses_reaches_no_robot(cell: Cell) -> None:
+    with cell.run_folder() as run:
+        cell.learning(run, BrokenOnce(cell.checkpoint, batch_size=BATCH)).run(versions=1)
+        assert run.state.refused == 1 and [known.version for known in run.state.versions] == ["2", "3"]
+    refusals = [line for line in cell.said if "the gate refused it" in line]
+    assert len(refusals) == 1 and "learning goes on from version 2" in cell.said
+    assert set(cell.acted) == {"2"} and cell.aliases()["learning"] == "3"
+
+
+def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
+    with cell.run_folder() as run:
+        with pytest.raises(UsageError, match="another process learns in it"):
+            cell.run_folder()
+
+        def play_and_move(_seconds: float) -> None:
+            for _ in range(BATCH // LENGTH):
+                cell.play()
+            with cell.admin() as client:
+                client.alias("policy", "learning", "1")
+
+        with pytest.raises(ConflictError, match="leads to version 1, and this run has let it lead to 2"):
+            cell.learning(run, sleep=play_and_move).run(versions=1)
+    assert cell.aliases()["learning"] == "1"
+
+
+def test_the_learner_sees_what_the_acting_version_saw(
+    zoo: Path, exported: Callable[..., ExportResult], tmp_path: Path
+) -> None:
+    """Through its filter's statistics; a module with its weights gives the recorded distributions."""
+    rng = np.random.default_rng(1)
+    with WithRecording(Policy.load(exported(zoo / "pendulum").path), tmp_path / "run.mcap") as policy:
+        for step in range(LENGTH):
+            policy.act(rng.standard_normal(3).astype(np.float32), explore=True)
+            policy.outcome(1.0, terminated=step == LENGTH - 1)
+    (episode,) = episodes(Recording(tmp_path / "run.mcap"))
+    made = single_agent_episode(episode, episode.own_action, episode.reward, id_="0", with_distribution=True)
+    learner = OnlineLearner(zoo / "pendulum")
+    (seen,) = learner.seen([made], zoo / "pendulum")
+    module = RLModule.from_checkpoint(str(zoo / "pendulum/learner_group/learner/rl_module/default_policy"))
+    obs = torch.as_tensor(np.asarray(seen.get_observations())[:-1])
+    given = module.forward_exploration({Columns.OBS: obs})[Columns.ACTION_DIST_INPUTS]
+    assert np.asarray(seen.get_extra_model_outputs(Columns.ACTION_DIST_INPUTS)) == pytest.approx(
+        given.detach().numpy(), abs=1e-5
+    )
+    assert not np.allclose(obs, np.asarray(made.get_observations())[:-1])
+    assert np.asarray(seen.get_extra_model_outputs(Columns.ACTION_LOGP)) == pytest.approx(episode.logp, abs=1e-5)
