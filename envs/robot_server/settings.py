@@ -129,13 +129,13 @@ _KINDS: dict[str, type[Settings]] = {"ur": URSettings, "mir100": Mir100Settings}
 def settings_to_json(settings: Settings) -> str:
     """Return the settings as one line that `settings_from_json` understands."""
     kind = "ur" if isinstance(settings, URSettings) else "mir100"
-    return json.dumps({"robot": kind, **asdict(settings)})
+    return json.dumps({"kind": kind, **asdict(settings)})
 
 
 def settings_from_json(line: str) -> Settings:
     """Return the settings of a line written by `settings_to_json`."""
     values: dict[str, Any] = json.loads(line)
-    kind = _KINDS[values.pop("robot")]
+    kind = _KINDS[values.pop("kind")]
     if values.get("objects") is not None:
         values["objects"] = tuple(values["objects"])
     return kind(**values)
