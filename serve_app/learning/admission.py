@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,5 +133,4 @@ def reward_of(source: str, name: str) -> Reward:
         raise UsageError(f"--reward {name} cannot be loaded: {first_line(error)}") from error
     if not callable(reward := namespace.get("reward")):
         raise UsageError(f"--reward {name}: expected a function reward(obs, action, next_obs) in it")
-    found: Reward = reward
-    return found
+    return cast(Reward, reward)

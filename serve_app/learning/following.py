@@ -61,10 +61,14 @@ class FollowedRecordings:
                 for entry in reader.entries():
                     for episode in assembler.add(entry):
                         yield Ended(str(path), f"{episode.id}@{episode.wall_ns[0]}", episode)
-            except (RecordingError, OSError) as error:
-                facts.damage = str(error)
+            except RecordingError as error:
+                facts.damage = error.message
+                self._notify(f"{error.message}: left out")
+                continue
+            except OSError as error:
+                facts.damage = error.strerror or str(error)
             if facts.damage is not None:
-                self._notify(f"{path} is not read any further: {facts.damage}")
+                self._notify(f"{path} is read no further: {facts.damage}")
 
     def _open(self, path: Path) -> tuple[FileFacts, FileReader, int]:
         facts = FileFacts(path)

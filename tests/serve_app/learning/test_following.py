@@ -74,7 +74,7 @@ def test_a_file_that_is_no_recording_is_named_once_and_the_others_are_read(
         act(policy, 2, ends=True)
     followed = FollowedRecordings([tmp_path], said.append)
     assert len(polled(followed, 1)) == 1
-    assert len(said) == 1 and "another.mcap is no MCAP file" in said[0]
+    assert len(said) == 1 and "another.mcap is not an MCAP file: left out" in said[0]
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
