@@ -1,4 +1,4 @@
-"""Programs of docs/how-to/compile.md, compiled against a policy and stubs of the libraries around it."""
+"""Programs of docs/how-to/compile.md and examples/compiled, compiled against a policy and stubs around it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ import pytest
 
 from rlservo.export.compiled.compile import Compiled
 
-GUIDE = Path(__file__).resolve().parents[3] / "docs/how-to/compile.md"
+ROOT = Path(__file__).resolve().parents[3]
 STUBS = Path(__file__).with_name("targets") / "stubs"
-LOOP, CONTROLLER, SKETCH = (block for _, block in re.findall(r"```(c|cpp)\n(.*?)```", GUIDE.read_text(), re.DOTALL))
+(LOOP,) = re.findall(r"```c\n(.*?)```", (ROOT / "docs/how-to/compile.md").read_text(), re.DOTALL)
+CONTROLLER, SKETCH = (
+    (ROOT / "examples" / "compiled" / name).read_text() for name in ("policy_controller.cpp", "policy.ino")
+)
 
 
 def compiles(source: str, folder: Path, name: str, *flags: str) -> Path:

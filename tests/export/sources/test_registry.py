@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,15 +15,14 @@ from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.export.sources.registry import find_source, sources
 from rlservo.serve_app.runtime.policy import Policy
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "sources.md"
+EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "linear_source.py"
 
 
 @pytest.fixture
 def other_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A package beside ours, as pip installs it, with the source that docs/how-to/sources.md shows."""
+    """A package beside ours, as pip installs it, with the source of examples/linear_source.py."""
     (tmp_path / "site").mkdir()
-    example = DOCUMENT.read_text().rpartition("```python\n")[2].partition("```")[0]
-    (tmp_path / "site" / "linear_source.py").write_text(example)
+    shutil.copy(EXAMPLE, tmp_path / "site")
     info = tmp_path / "site" / "linear_source-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: linear-source\nVersion: 1.0\n")

@@ -1,4 +1,4 @@
-// What the sketch of docs/how-to/compile.md uses of an Arduino core, and of its owner.
+// What the sketch of examples/compiled uses of an Arduino core, and of its owner.
 #pragma once
 #include <cstdint>
 

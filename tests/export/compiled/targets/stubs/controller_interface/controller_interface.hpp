@@ -1,4 +1,4 @@
-// What the controller of docs/how-to/compile.md uses of ros2_control (Humble, Jazzy).
+// What the controller of examples/compiled uses of ros2_control (Humble, Jazzy).
 #pragma once
 #include <cstddef>
 #include <string>

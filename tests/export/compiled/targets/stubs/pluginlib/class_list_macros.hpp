@@ -1,3 +1,3 @@
-// What the controller of docs/how-to/compile.md uses of pluginlib.
+// What the controller of examples/compiled uses of pluginlib.
 #pragma once
 #define PLUGINLIB_EXPORT_CLASS(kind, base) static_assert(sizeof(kind) >= sizeof(base), "a " #base);
