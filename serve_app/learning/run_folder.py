@@ -50,6 +50,7 @@ class RunFolder(Closeable):
         self.path = path.absolute()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            self._check_ours()
             self._lock = os.open(self.path / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise UsageError(f"--out {path} cannot be written: {error.strerror}") from error
@@ -99,12 +100,16 @@ class RunFolder(Closeable):
         """Let another process go on."""
         os.close(self._lock)
 
+    def _check_ours(self) -> None:
+        """Raise UsageError for a folder that holds anything that no run makes."""
+        ours = {LOCK_FILE, REWARD_FILE, STATE_FILE, f"{STATE_FILE}.part", "bundles", "checkpoints"}
+        others = sorted({entry.name for entry in self.path.iterdir()} - ours)
+        if others:
+            raise UsageError(f"--out {self.path} holds {others[0]}: expected a new folder, or that of a run")
+
     def _read(self, terms: dict[str, Any], reward_source: str | None) -> State:
         file, shown = self.path / STATE_FILE, self.path / REWARD_FILE
         if not file.exists():
-            others = [entry.name for entry in self.path.iterdir() if entry.name not in (LOCK_FILE, REWARD_FILE)]
-            if set(others) - {"bundles", "checkpoints", f"{STATE_FILE}.part"}:  # of a run killed before its first
-                raise UsageError(f"--out {self.path} holds {others[0]}: expected a new folder, or that of a run")
             if reward_source is not None:
                 shown.write_text(reward_source)
             return State(terms)

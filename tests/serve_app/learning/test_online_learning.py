@@ -200,6 +200,20 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
     assert cell.aliases()["learning"] == "1"
 
 
+def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "thesis.pdf").touch()
+    with pytest.raises(UsageError, match=r"holds thesis\.pdf: expected a new folder, or that of a run"):
+        RunFolder(tmp_path, {}, None)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.pdf"]
+    with RunFolder(tmp_path / "run", {"policy": "a"}, "def reward(): ...") as run:
+        run.commit(())
+    assert (tmp_path / "run" / "reward.py").read_text() == "def reward(): ..."
+    with pytest.raises(UsageError, match="is a run with policy 'a', not 'b'"):
+        RunFolder(tmp_path / "run", {"policy": "b"}, "def reward(): ...")
+    with pytest.raises(UsageError, match="--reward is not what this run began with"):
+        RunFolder(tmp_path / "run", {"policy": "a"}, None)
+
+
 def test_the_learner_sees_what_the_acting_version_saw(
     zoo: Path, exported: Callable[..., ExportResult], tmp_path: Path
 ) -> None:

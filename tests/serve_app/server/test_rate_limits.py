@@ -181,9 +181,10 @@ class Context:
         self.trailing.update(pairs)
 
 
-def infer() -> bytes:
+def infer(*, explore: bool = False) -> bytes:
     request = messages.ModelInferRequest(model_name="ur5")
     request.inputs.add(name="obs", datatype="FP32", shape=[1, 27]).contents.fp32_contents.extend(OBS)
+    request.parameters["explore"].bool_param = explore
     return bytes(request.SerializeToString())
 
 
@@ -215,6 +216,21 @@ def test_a_grpc_streams_messages_count_and_it_goes_on(app: PolicyApp) -> None:
     # Opening it is a request, too.
     assert errors[: BURST - 1] == [""] * (BURST - 1) and all("may ask" in error for error in errors[BURST - 1 :])
     assert len(errors) == BURST + 2 and context.code is None
+
+
+def test_grpc_refuses_exploring_to_a_key_for_actions_alone(app: PolicyApp) -> None:
+    async def requests() -> AsyncIterator[bytes]:
+        yield infer(explore=True)
+        yield infer()
+
+    async def calls() -> tuple[Context, list[str]]:
+        service, context = Grpc(app.state.handler), Context(FREE)
+        await service.answer("ModelInfer", (infer(explore=True), None), context)
+        return context, [reply.error_message async for reply in service.stream(requests(), Context(FREE))]
+
+    refused, streamed = asyncio.run(calls())
+    assert refused.code is grpc.StatusCode.PERMISSION_DENIED and "may not ask for exploring" in refused.details
+    assert "may not ask for exploring" in streamed[0] and streamed[1] == ""
 
 
 def test_a_bucket_fills_with_time_up_to_its_burst_and_is_its_labels() -> None:
