@@ -110,7 +110,8 @@ class _Connection:
             import rtde_control
             import rtde_receive
         except ImportError as error:
-            raise RobotError(f"a real UR arm needs ur_rtde ({error}): pip install '.[ur]' in the checkout of rlservo") from error
+            how = "pip install '.[ur]' in the checkout of rlservo"
+            raise RobotError(f"a real UR arm needs ur_rtde ({error}): {how}") from error
         self.control: Any = None
         host = settings.host
         try:
