@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import os
 import re
 import subprocess
 from pathlib import Path
@@ -16,8 +15,6 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy", "examples")
 OLDEST = (3, 10)
 CLASSIFIER = re.compile(r'"Programming Language :: Python :: 3\.(\d+)"')
-SERVING = ("client", "serve", "sim", "record", "remote", "cockpit")  # what unit tests need of the extras
-TEST_TOOLS = ("pytest", "uvicorn", "httpx", "pyyaml", "jsonschema", "playwright", "moto")
 
 PROGRAM = """
 import sys
@@ -96,26 +93,6 @@ def test_base_and_client_run_on_every_python_that_is_named(minor: str, ur5: Path
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("refused\nacted (6,)\n") and "algorithm" in done.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1500)  # minutes of processor time, on cores that other tests have as well
-def test_unit_tests_pass_on_the_newest_python(tmp_path: Path) -> None:
-    """`make quick` with that interpreter, without torch and RLlib: with them it would be an install of gigabytes."""
-    minor = max(CLASSIFIER.findall(project()), key=int)
-    tools = [line for line in requirements("dev") if line.startswith(TEST_TOOLS)]
-    needed = [*requirements(*SERVING), "onnx", "matplotlib", *tools]
-    python = environment_of(minor, "-c", ROOT / "constraints.txt", *needed)
-    path = linked_package(tmp_path)
-    (path / "sitecustomize.py").write_text(f"import site\nsite.addsitedir({str(path)!r})\n")
-    own = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    done = subprocess.run(
-        ["make", "--silent", "--old-file=setup", "quick", f"VENV={python.parents[1]}"],
-        capture_output=True, text=True, cwd=ROOT, env={**own, "PYTHONPATH": str(path)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-5000:] + done.stderr
-    passed = re.search(r"(\d+) passed", done.stdout)
-    assert passed is not None and int(passed[1]) > 1250, done.stdout[-500:]
 
 
 @pytest.mark.parametrize(
