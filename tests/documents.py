@@ -126,11 +126,16 @@ class Shell:
         assert code == 0, f"{script}\n{output}"
         return output
 
+    @property
+    def runtime(self) -> Path:
+        """A folder of its own: a folder `rlservo` beside a script would hide an editable install's package."""
+        return self.folder / "runtime"
+
     def _start(self, script: str, output: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
             "HOME": str(self.folder),
-            "XDG_RUNTIME_DIR": str(self.folder),
+            "XDG_RUNTIME_DIR": str(self.runtime),
             "RLSERVO_URL": f"http://127.0.0.1:{self.ports['8000']}",
         }
         with (self.folder / output).open("wb") as file:
@@ -153,6 +158,7 @@ def shell(folder: Path) -> Iterator[Shell]:
     for name in ("examples", "deploy"):
         (folder / name).symlink_to(ROOT / name)
     opened = Shell(folder)
+    opened.runtime.mkdir()
     try:
         yield opened
     finally:
