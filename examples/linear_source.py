@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 
-from rlservo.export.contract.errors import CheckpointError
+from rlservo import errors
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.sources.restored_policy import RestoredPolicy
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source, one_policy
@@ -35,7 +35,7 @@ class Linear(Source):
     def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:
         weights = np.load(files.root, allow_pickle=False)
         if weights.ndim != 2:
-            raise CheckpointError(f"{files.root}: expected a matrix, got an array of shape {weights.shape}")
+            raise errors.CheckpointError(f"{files.root}: expected a matrix, got an array of shape {weights.shape}")
         actions, observations = weights.shape
         recipe = Recipe(
             observation_space=Box(-np.inf, np.inf, (observations,), np.float32),

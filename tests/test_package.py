@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 NAMES = [
     "ActingPolicy",
     "AdminClient",
+    "CompiledPolicy",
     "Policy",
     "PolicyClient",
     "Recorder",
@@ -25,6 +26,7 @@ NAMES = [
     "__version__",
     "errors",
     "export_checkpoint",
+    "export_policy",
     "rollout",
 ]
 

@@ -35,7 +35,7 @@ def test_metadata_installs_no_developers_tools_and_has_no_placeholder(wheel: Pat
         text = archive.read(next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))).decode()
     head, _, readme = text.partition("\n\n")
     (everything,) = [line for line in head.splitlines() if line.endswith('extra == "all"')]
-    assert everything == 'Requires-Dist: rlservo[client,cockpit,ray,record,remote,serve,sim,train]; extra == "all"'
+    assert everything == 'Requires-Dist: rlservo[client,cockpit,ray,record,remote,serve,sim,train,ur]; extra == "all"'
     assert "<this repository>" not in readme
 
 

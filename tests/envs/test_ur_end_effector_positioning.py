@@ -45,8 +45,10 @@ def hold_action(env: EndEffectorPositioningURSim) -> np.ndarray:
     return action[:5].astype(np.float32)
 
 
-def test_gym_make_finds_it_in_a_fresh_process_without_an_import() -> None:
-    code = f"import gymnasium as gym; env = gym.make({ENV_ID!r}); env.reset(seed=0); print(env.spec.id)"
+def test_gym_make_finds_it_in_a_fresh_process_by_the_module_before_its_id() -> None:
+    code = (
+        f"import gymnasium as gym; env = gym.make({'rlservo.envs:' + ENV_ID!r}); env.reset(seed=0); print(env.spec.id)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert done.stdout.strip() == ENV_ID, done.stderr
 

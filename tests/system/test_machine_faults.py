@@ -124,7 +124,10 @@ def test_clients_ask_this_machine_directly_whatever_http_proxy_says(
     assert done.stdout == "True\n", done.stderr
 
 
-def test_without_a_loopback_interface_the_command_ends_with_a_sentence(policies: Path) -> None:
+def test_without_a_loopback_interface_the_command_ends_with_a_sentence(
+    policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RLSERVO_PLAN", str(tmp_path))
     command = [*in_own_namespace("--net"), sys.executable, "-m", "rlservo.deploy.cli", "serve", str(policies)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
     assert (done.returncode, done.stdout) == (2, "")

@@ -126,7 +126,7 @@ def test_what_does_not_fit_is_said_and_nothing_changes(drives: Callable[..., Dri
     wait_for(lambda: drive.view.refusal == "", "another command is followed")
     with pytest.raises(UsageError, match="does not fit rlservo/NoObstacle"):
         Drive(BundledPolicies(two_versions), Choice("ur5", "1"), env_id="rlservo/NoObstacleNavigationMir100Sim-v0")
-    with pytest.raises(UsageError, match="CartPole-v1 is none of them"):
+    with pytest.raises(UsageError, match="CartPole-v1 is not one of them"):
         Drive(BundledPolicies(two_versions), Choice("ur5", "1"), env_id="CartPole-v1")
 
 

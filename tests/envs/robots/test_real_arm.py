@@ -107,7 +107,8 @@ def test_suspended_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, mo
     finally:
         os.kill(moving.pid, signal.SIGCONT)
     arm.wait_until(lambda: bool(moving.fault()))
-    assert moving.fault().partition(":")[0] in ("program_stopped", "connection_lost")
+    # Which of them is seen first: the program that ended, or what it no longer takes.
+    assert moving.fault().partition(":")[0] in ("program_stopped", "connection_lost", "command_refused")
 
 
 def test_link_that_is_down_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:

@@ -627,7 +627,7 @@ def test_killed_half_way_it_goes_on_with_what_was_counted(run: Any, server: Serv
 
     outcome = again(end_of_time)
     assert outcome.outcome == PROMOTED, outcome
-    assert any("goes on" in line for line in again.said)
+    assert any("continues" in line for line in again.said)
     assert again.answered("1") + again.answered("2") == 200
     assert server.state == ("2", None, None)
 
@@ -788,7 +788,7 @@ def test_a_clock_that_was_set_meanwhile_adds_no_time(
     monkeypatch.setattr("rlservo.serve_app.client.promotion.time.time", lambda: now() + jump_s)
     steps = [lambda: server.ask(60 if jump_s < 0 else 0), *[lambda: None] * 9]
     outcome = promotion(*steps, lambda: pytest.fail("it goes on indefinitely"))
-    assert any(f"goes on: {left}" in line for line in promotion.said), promotion.said
+    assert any(f"continues: {left}" in line for line in promotion.said), promotion.said
     assert outcome.outcome == (PROMOTED if jump_s < 0 else ROLLED_BACK) and server.plan.canary is None
 
 
