@@ -55,6 +55,6 @@ class Load:
                 except RlservoError as error:
                     self.failures.append(error.message)
                 else:
-                    self.wrong += not any(np.allclose(action, right, rtol=1e-6) for right in self.expected)
+                    self.wrong += not any(np.array_equal(action, right) for right in self.expected)
                 self.asked += 1
                 time.sleep(0.005)

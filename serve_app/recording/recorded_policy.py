@@ -55,7 +55,7 @@ class WithRecording(ActingPolicy):
         self._episode = ""
         self._step = 0
         self.robot: Mapping[str, Any] | None = None
-        """What the next outcome holds of a real robot; whoever has its `info` sets it."""
+        """State of a real robot for the next outcome; the control loop sets it from `info`."""
         self.begin()
 
     @property
