@@ -91,7 +91,7 @@ class Request:
     stream_id: str | None = None
     """Of its WebSocket, whose requests share a request id and are distinguished by `seq`."""
 
-    may_explore: bool = True
+    may_explore: bool = False
     """Whether its key may ask for exploring actions."""
 
     obs: Any = None
