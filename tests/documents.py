@@ -114,7 +114,12 @@ class Shell:
         for started in self.groups:
             with suppress(ProcessLookupError):
                 os.killpg(started.pid, signal.SIGTERM)
-            started.wait(60)
+            try:
+                started.wait(60)
+            except subprocess.TimeoutExpired:
+                os.killpg(started.pid, signal.SIGKILL)
+                started.wait()
+                raise
         self.groups.clear()
 
     def _finish(self, script: str) -> str:

@@ -278,5 +278,7 @@ class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
     not ask), and `info["robot"]`: the state, its changes, and the limits that were kept since the last step.
     """
 
-    def __init__(self, *, robot: str, **arguments: Any) -> None:
+    def __init__(self, *, robot: str = "", **arguments: Any) -> None:
+        if not robot:
+            raise ValueError("robot is missing: expected the arm's address, say robot=rtde://192.168.0.2")
         super().__init__(robot=robot, **arguments)
