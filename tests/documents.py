@@ -27,7 +27,7 @@ BLOCK = re.compile(
 )
 STAYS = re.compile(r"^rlservo (serve|cockpit|server-manager|robot-server)\b")  # until Ctrl-C
 NOT_HERE = re.compile(r"^(pip install|make) ")  # tests/test_wheel.py installs, tests/system/test_demo.py makes
-PORTS = ("8000", "8080", "8090")
+PORTS = ("8000", "8080", "8090", "6379")
 PATIENCE_S = 300.0
 
 
@@ -153,7 +153,7 @@ class Shell:
 
     def _with_ports(self, text: str) -> str:
         for printed, ours in self.ports.items():
-            text = re.sub(rf"(127\.0\.0\.1:|http\.server ){printed}\b", rf"\g<1>{ours}", text)
+            text = re.sub(rf"(127\.0\.0\.1:|http\.server |--port ){printed}\b", rf"\g<1>{ours}", text)
         return text
 
 

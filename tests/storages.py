@@ -65,6 +65,10 @@ class Storage:
         """How often an object whose name ends so was read."""
         return sum(line.startswith("GET ") and line.endswith(end) for line in self.proxy.requests)
 
+    def make(self, bucket: str) -> None:
+        """Make another bucket; it may be there."""
+        _make_bucket(self.proxy.upstream, bucket)
+
     def change(self, method: str, name: str, content: bytes = b"") -> None:
         """Write or delete an object behind everybody's back."""
         path = self.uri.removeprefix("s3:/") + "/" + name
@@ -161,6 +165,10 @@ def moto() -> Iterator[int]:
     patch.undo()
 
 
+def _make_bucket(port: int, name: str) -> None:
+    assert _ask(port, "PUT", f"/{name}", {}, b"")[0] == 200
+
+
 @pytest.fixture
 def storage(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Storage]:
     """A bucket of its own, and the environment to reach it through a proxy."""
@@ -168,7 +176,7 @@ def storage(moto: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Storage]:
     thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
     thread.start()
     bucket = f"policies-{os.getpid()}-{next(_buckets)}"
-    assert _ask(moto, "PUT", f"/{bucket}", {}, b"")[0] == 200
+    _make_bucket(moto, bucket)
     environment = {
         "AWS_ACCESS_KEY_ID": "moto",
         "AWS_SECRET_ACCESS_KEY": SECRET,

@@ -15,6 +15,7 @@ from documents import ROOT, blocks, commands, pages, shell, unknown_options
 from rlservo.deploy.demo.demo import ROBOTS
 
 README = ROOT / "README.md"
+CARTPOLE = ROOT / "examples" / "checkpoints" / "cartpole_dqn"
 TUTORIAL = ROOT / "docs" / "tutorial" / "first-robot.md"
 # Their client is robo-gym's Python: tests/system/test_robo_gym_client.py runs them.
 WITH_ROBO_GYM = {"robo-gym.md", "real-arm.md"}
@@ -67,10 +68,21 @@ def test_tutorial_runs_as_printed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
-def test_guide_runs_as_printed(page: Path, shipped: Path, tmp_path: Path) -> None:
+def test_guide_runs_as_printed(page: Path, shipped: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     if not any(block.language in ("sh", "python") and not block.reason for block in blocks(page)):
         pytest.skip("none of its blocks can run here; the next test checks them")
     shutil.copytree(shipped / "ur5", tmp_path / "policies" / "ur5")
+    text = page.read_text(encoding="utf-8")
+    if "s3://bucket/" in text:
+        request.getfixturevalue("storage").make("bucket")
+    if "~/ray_results/PPO_2026" in text:  # HOME is this folder
+        trial = tmp_path / "ray_results" / "PPO_2026" / "trial"
+        shutil.copytree(CARTPOLE, trial / "checkpoint_000000")
+        iteration = json.loads((CARTPOLE / "rlservo_facts.json").read_text())["training_iterations"]
+        result = {"training_iteration": iteration, "env_runners": {"episode_return_mean": 450.0}}
+        (trial / "result.json").write_text(json.dumps(result))
+        shutil.copytree(CARTPOLE, tmp_path / "runs" / "mine" / "checkpoint_000010")
+        (tmp_path / "my_project").mkdir()
     ran(page, tmp_path)
 
 
