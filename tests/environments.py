@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import shutil
@@ -78,6 +79,7 @@ def environment_with(wheel: Path, folder: Path, *extras: str) -> Path:
     return folder
 
 
+@functools.cache
 def required_by(*extras: str) -> set[str]:
     """Return the names of all packages that these extras require."""
     return {distribution.name.lower() for distribution in _required("rlservo", set(extras))}
