@@ -51,7 +51,7 @@ requestAnimationFrame(count);
 RENDERER = """() => {
   const gl = document.createElement("canvas").getContext("webgl2");
   const known = gl?.getExtension("WEBGL_debug_renderer_info");
-  return known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "not told";
+  return known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "unknown";
 }"""
 
 

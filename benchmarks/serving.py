@@ -99,7 +99,7 @@ def started(peer: Peer) -> Iterator[subprocess.Popen[bytes]]:
         except Exception as error:
             output.seek(0, os.SEEK_END)
             output.seek(max(0, output.tell() - 400))
-            raise RuntimeError(f"{error}; its last words: {output.read().decode(errors='replace')}") from error
+            raise RuntimeError(f"{error}; its last output: {output.read().decode(errors='replace')}") from error
         finally:
             end(server)
 
@@ -330,13 +330,13 @@ def processor() -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--install", action="store_true", help="make the peers' environments, and end")
+    parser.add_argument("--install", action="store_true", help="make the peers' environments and exit")
     parser.add_argument(
         "--publish", action="store_true", help=f"write {PUBLISHED.relative_to(ROOT)} when all is measured"
     )
     parser.add_argument("--quick", action="store_true", help="one short round, to see that it works")
     parser.add_argument("--again", action="store_true", help="forget what an earlier run has measured")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="stop after this time; the next run goes on")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="stop after this time; the next run continues")
     parser.add_argument("--only", nargs="+", choices=list(MAKERS), default=list(MAKERS), help="these servers")
     parser.add_argument("--out", type=Path, default=ROOT / "bench", help="folder of the policy and the raw figures")
     given = parser.parse_args()
@@ -360,7 +360,7 @@ def main() -> None:
     tables = report(read(file))
     print(tables)
     if not is_complete:
-        print("the time is over: run it again to go on", file=sys.stderr)
+        print("time is up: run it again to continue", file=sys.stderr)
         sys.exit(2)
     if given.publish:
         PUBLISHED.parent.mkdir(exist_ok=True)

@@ -49,7 +49,7 @@ def offscreen_context(width: int, height: int) -> Any:
     """
     backend = os.environ.get("MUJOCO_GL", "").strip().lower()
     if not hasattr(mujoco, "GLContext"):
-        raise CannotDrawError(f"no picture can be drawn: MUJOCO_GL={backend} turns MuJoCo's pictures off")
+        raise CannotDrawError(f"no picture can be drawn: MUJOCO_GL={backend} turns MuJoCo's rendering off")
     if backend not in ("egl", "osmesa"):
         if has_display():
             return mujoco.GLContext(width, height)

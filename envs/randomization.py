@@ -323,7 +323,9 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"{name} is {value!r}: expected numbers, {REAL!r} or a multiple such as '2*{REAL}'")
         env = self.env.unwrapped
         if not isinstance(env, HasSensorErrors):
-            raise ValueError(f"{name} is {value!r}: {type(env).__name__} does not state its sensors' (sensor_errors)")
+            raise ValueError(
+                f"{name} is {value!r}: {type(env).__name__} does not state its sensors' errors (sensor_errors)"
+            )
         errors = env.sensor_errors()
         attribute = "noise" if name == "observation_noise" else "bias"
         return {element: scale * float(getattr(error, attribute)) for element, error in errors.items()}

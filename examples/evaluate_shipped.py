@@ -158,7 +158,7 @@ def main() -> None:
     if args.episodes < 2 or args.seed < 0:
         parser.error(f"--episodes is {args.episodes} and --seed {args.seed}: expected at least 2 and 0")
     if args.checkpoint is not None and (len(names) != 1 or args.write):
-        parser.error("--checkpoint goes with one NAME and without --write: cards are of what ships")
+        parser.error("--checkpoint needs one NAME and no --write: cards describe what ships")
     with tempfile.TemporaryDirectory() as bundles:
         for name in names:
             try:

@@ -252,7 +252,7 @@ def end_simulator(env: Any) -> None:
     try:
         env.kill_sim()
     except Exception as error:  # its manager is gone, and with it the robot server
-        print(f"the robot server could not be told to end: {error}", file=sys.stderr)
+        print(f"the robot server could not be stopped: {error}", file=sys.stderr)
     env.expect_sim_running = False  # or `__del__` tries ten times more
 
 

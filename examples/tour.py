@@ -46,15 +46,15 @@ class Settings:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="RLlib's introduction, on today's Ray, ending in bundles and videos.")
+    parser = argparse.ArgumentParser(description="A tour of RLlib on current Ray, up to bundles and videos.")
     parser.add_argument("stops", nargs="*", metavar="STOP", help="cartpole, frozenlake, ur5 (default: all three)")
     parser.add_argument("--out", type=Path, default=Path("tour"), help="folder for runs, bundles and videos")
-    parser.add_argument("--quick", action="store_true", help="train for moments only")
+    parser.add_argument("--quick", action="store_true", help="train only briefly")
     parser.add_argument("--no-video", action="store_true", help="draw nothing, without OpenGL")
     args = parser.parse_args()
     stops: dict[str, Callable[[Settings], None]] = {"cartpole": cartpole, "frozenlake": frozen_lake, "ur5": ur5}
     if unknown := [stop for stop in args.stops if stop not in stops]:
-        parser.error(f"{unknown[0]} is no stop of the tour: expected {', '.join(stops)}")
+        parser.error(f"{unknown[0]} is not a stop of the tour: expected {', '.join(stops)}")
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws CartPole without a display
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # and looks for a sound card
     training_run.pickle_by_value(sys.modules[__name__])

@@ -315,7 +315,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         raise errors.UsageError(f"{path}: no YAML: {error}") from error
     missing = [name for name in NEEDED if not isinstance(settings, dict) or name not in settings]
     if missing:
-        raise errors.UsageError(f"{path}: has no {missing[0]}; {SHIPPED}/*/training.yaml show what there is")
+        raise errors.UsageError(f"{path}: has no {missing[0]}; {SHIPPED}/*/training.yaml are examples")
     return cast("dict[str, Any]", settings)
 
 
@@ -329,7 +329,7 @@ def change_settings(settings: dict[str, Any], changes: list[str]) -> None:
             where = where.get(parent) if isinstance(where, dict) else None
         if not equals or not isinstance(where, dict) or last not in where:
             raise ValueError(
-                f"--set {change}: expected KEY=VALUE with a key that training.yaml has, say stop.env_steps=20000"
+                f"--set {change}: expected KEY=VALUE with a key that training.yaml has, such as stop.env_steps=20000"
             )
         where[last] = yaml.safe_load(value)
 
@@ -469,7 +469,7 @@ def train(
                 if (is_full and value >= stop["value"]) or row.env_steps >= stop["env_steps"]:
                     break
     except KeyboardInterrupt:
-        print("interrupted: what has been reached is kept")
+        print("interrupted: the results so far are kept")
     finally:
         has_learned = bool(rows) and rows[-1].trained_steps > 0
         if best == float("-inf") and has_learned:  # too short for a first mean: a checkpoint all the same
@@ -517,12 +517,12 @@ def install(name: str, folder: Path) -> None:
 
 def main() -> None:
     names = sorted(path.parent.name for path in SHIPPED.glob("*/training.yaml"))
-    parser = argparse.ArgumentParser(description="Train one of the policies that ship again.")
+    parser = argparse.ArgumentParser(description="Retrain one of the shipped policies.")
     parser.add_argument("name", choices=names)
     parser.add_argument("--seed", type=int, help="instead of the one in training.yaml")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
-        help="change a setting of training.yaml for this run, say stop.env_steps=20000 or model.use_lstm=false",
+        help="change a setting of training.yaml for this run, such as stop.env_steps=20000 or model.use_lstm=false",
     )  # fmt: skip
     parser.add_argument("--settings", type=Path, help="a file of your own instead of the policy's training.yaml")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")

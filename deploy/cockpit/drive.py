@@ -294,7 +294,7 @@ class Drive:
     def _wait_for_server(self, error: RlservoError) -> None:
         """Say it, and ask again soon: the robot stands, and what it sees has not changed."""
         self._late += isinstance(error, DeadlineError)
-        self._trouble = f"waiting for the policy, the robot stands: {error.message}"
+        self._trouble = f"waiting for the policy; the robot holds still: {error.message}"
         self._before = self._after
         self._due = time.perf_counter() + RETRY_S
         if isinstance(error, UnknownPolicyError):  # a server that was started again, with other versions
@@ -364,7 +364,7 @@ class Drive:
         self._successes += is_success
         if is_arrival and self._is_users_target:
             self._phase = "arrived"
-            self._sentence = "Arrived. Drag the target on, or let a new one be drawn."
+            self._sentence = "Arrived. Drag the target, or draw a new one."
             return
         goes_on = is_success or status == "max_steps_exceeded"
         self._next = ("here" if goes_on else self._start, self._is_users_target)
@@ -432,7 +432,7 @@ class Drive:
 
     def _refuse_second_robot(self, what: str) -> None:
         if getattr(self._stage.env, "is_real", False):
-            raise UsageError(f"{what} cannot be had beside a real robot: start the cockpit again")
+            raise UsageError(f"{what} cannot be combined with a real robot: restart the cockpit")
 
     def _drop_ghost(self) -> None:
         if self._ghost is not None:

@@ -192,5 +192,5 @@ def _refusal(headers: Any) -> str:
         return f"the host {host[:100]!r} is not this machine: the cockpit is at {HOST}"
     origins = headers.get_all("Origin")
     if any(origin.lower() not in (f"http://{host}", f"https://{host}") for origin in origins):
-        return f"a page of {', '.join(origins)[:100]} may not use the cockpit"
+        return f"a page from {', '.join(origins)[:100]} may not use the cockpit"
     return ""

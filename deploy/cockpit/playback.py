@@ -49,7 +49,8 @@ class Tape:
                 self.episodes.append(followed.episode)
                 if "action" not in followed.action:
                     raise UsageError(
-                        f"the actions of {followed.episode.policy.title} are nested, which none of rlservo's robots has"
+                        f"the actions of {followed.episode.policy.title} are nested: no robot of rlservo takes nested "
+                        "actions"
                     )
                 difference = followed.action["action"] - followed.episode.action["action"]
                 difference = difference.reshape(len(followed.episode), -1).astype(np.float64)

@@ -128,7 +128,7 @@ def home_of(contract: Contract) -> str:
     if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
         raise UsageError(
             f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, which the cockpit "
-            f"cannot draw: name one of rlservo's simulators that it fits with --env"
+            f"cannot draw: choose a matching simulator of rlservo with --env"
         )
     return env_id
 

@@ -80,7 +80,7 @@ def promote(
 
     for text, pattern, what in ((name, NAME_PATTERN, "policy name"), (version, VERSION_PATTERN, "version")):
         if re.fullmatch(pattern, text) is None:  # both become part of a file's name
-            raise UsageError(f"{text[:80]!r} is no {what}")
+            raise UsageError(f"{text[:80]!r} is not a {what}")
     limits = Limits(
         error_rate=_number("--max-error-rate", max_error_rate, PERCENT, 1.0),
         p99_s=_number("--max-p99", max_p99, SECONDS, 1.0),

@@ -56,7 +56,7 @@ def verify(
     compiled: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of `rlservo compile`: drive --env with it too, on the same seeds, to the same endings."
+            help="Folder of `rlservo compile`: drive --env with it as well; the same seeds must end the same."
         ),
     ] = None,
     write: Annotated[
@@ -75,9 +75,9 @@ def verify(
     `rlservo verify policies/ur5 --compiled build --env rlservo/EndEffectorPositioningURSim-v0`
     """
     if not disturb and (disturbances or plot or write):
-        raise UsageError("disturbances, --plot and --write go with --disturb")
+        raise UsageError("disturbances, --plot and --write need --disturb")
     if env_arg and not disturb and compiled is None:
-        raise UsageError("--env-arg goes with --disturb and --compiled")
+        raise UsageError("--env-arg needs --disturb or --compiled")
     env = env and plain_id(env)
     if checkpoint is None and not disturb and compiled is None:
         raise UsageError("give --checkpoint to compare the bundle with, or --env with --disturb or --compiled")
@@ -169,7 +169,8 @@ def _verify_compiled(
     for a, b in pairs:
         if (a.final_status, a.steps) != (b.final_status, b.steps):
             raise ParityError(
-                f"episode {a.index} (seed {a.seed}) ends otherwise: with the bundle '{a.final_status}' after {a.steps}"
+                f"episode {a.index} (seed {a.seed}) ends differently: with the bundle '{a.final_status}' after "
+                f"{a.steps}"
                 f" steps, with its C '{b.final_status}' after {b.steps}"
             )
     apart = max(abs(a.episode_return - b.episode_return) for a, b in pairs)

@@ -94,7 +94,7 @@ class Mir100Simulation:
         target_pose = self._target if target is None else _pose("target", target)
         cube_poses = self._cubes if cubes is None else [_pose(f"cube {i}", cube) for i, cube in enumerate(cubes)]
         if len(cube_poses) != len(self._cubes):
-            raise ValueError(f"{len(cube_poses)} cubes were given, world {self.world.name!r} has {len(self._cubes)}")
+            raise ValueError(f"{len(cube_poses)} cubes were given; world {self.world.name!r} has {len(self._cubes)}")
         self._target, self._cubes = target_pose, cube_poses
 
         data = self.data
@@ -133,7 +133,7 @@ class Mir100Simulation:
         floor [N] is uniform from 0 to size times the weight, for turning [Nm] at half the wheels' separation.
         """
         if not 0.0 <= size <= MAX_MODEL_ERROR:
-            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's figures")
+            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's values")
         model, (mass, inertia, gains, biases) = self.model, self._data_sheet
         mass_factor, inertia_factor = rng.uniform(1.0 - size, 1.0 + size, 2).tolist()
         gain_factors = rng.uniform(1.0 - size, 1.0 + size, len(gains))

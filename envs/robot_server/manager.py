@@ -142,7 +142,9 @@ class RobotServers:
                     self._dead_ports.add(port)
             for port, server in exits:
                 server.kill()  # collects the process and its pipes
-                log.warning("%s on port %d ended by itself: %s", _title(server.settings), port, _why(server.exit_code))
+                log.warning(
+                    "%s on port %d exited unexpectedly: %s", _title(server.settings), port, _why(server.exit_code)
+                )
 
 
 class ManagerService:
@@ -223,8 +225,8 @@ def _bind_first(server: grpc.Server, host: str, ports: range | tuple[int, ...]) 
             if len(ports) == 1:
                 raise
     raise PortInUseError(
-        f"every port from {ports[0]} to {ports[-1]} on {host} is taken, where robo-gym's clients look for a manager: "
-        f"end another manager, or give a port"
+        f"every port from {ports[0]} to {ports[-1]} on {host} is taken: stop another manager, or give a port "
+        "(robo-gym's clients look for a manager on these)"
     )
 
 

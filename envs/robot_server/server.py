@@ -152,7 +152,7 @@ def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s
                 alone_since = time.monotonic()
                 continue
             if orphan_s is not None and time.monotonic() - alone_since > orphan_s:
-                log.warning("no client for %g s: this server shuts down", orphan_s)
+                log.warning("no client for %g s: shutting down", orphan_s)
                 return
     finally:
         server.stop()

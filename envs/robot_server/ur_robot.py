@@ -78,7 +78,7 @@ class URRobot:
         self._float_params, self._string_params = floats, strings
         if self.simulation.place(joints) and self.is_real:
             links = " and ".join(self.simulation.contacts()[0])
-            raise ValueError(f"a real arm is not sent where {links} would touch")
+            raise ValueError(f"a real arm is not moved to a pose in which {links} would touch")
         self.simulation.move_objects(paths)
         self.simulation.settle()
         return SETTLE_CYCLES
@@ -122,7 +122,7 @@ class URRobot:
             joints = np.array([by_name[name] for name in names], dtype=np.float64)
         else:
             missing = ", ".join(name for name in names if name not in target.names)
-            raise ValueError(f"state_dict lacks {missing}, and state is empty: expected where to put the arm")
+            raise ValueError(f"state_dict lacks {missing}, and state is empty: expected the arm's joint positions")
         for joint, position, limit in zip(JOINTS, joints.tolist(), POSITION_LIMITS, strict=True):
             if not abs(position) <= limit + ROUNDING:
                 raise ValueError(f"the position of {joint} is {position:g} rad: expected within +-{limit:g} rad")

@@ -161,7 +161,7 @@ class BasicAvoidanceURSim(URArmEnv):
             }
             if self._start_object("triangle_wave", wave, refuse=is_given):
                 return
-        raise InvalidResetError(f"{REDRAWS} random motions of the ball all hit the arm at the given joint positions")
+        raise InvalidResetError(f"all {REDRAWS} random motions of the ball hit the arm at the given joint positions")
 
     def _start_object(self, function: str, parameters: dict[str, float], *, refuse: bool = True) -> bool:
         sim = self.simulation

@@ -156,7 +156,7 @@ class EndEffectorPositioningURSim(URArmEnv):
             x, y, z = self.simulation.tool_position.tolist()
             if math.hypot(x, y) < CORNER_RADIUS or z < CORNER_HEIGHT:
                 return {"joint_positions": joints.tolist(), "randomize_start": False}
-        raise InvalidResetError(f"{REDRAWS} random poses were none in a corner")
+        raise InvalidResetError(f"none of {REDRAWS} random poses is in a corner")
 
     # -- for viewers
 
@@ -205,7 +205,7 @@ class EndEffectorPositioningURSim(URArmEnv):
             joints: Vector = np.clip(draw, -LIMITS, LIMITS)
             if not self.simulation.place(joints):
                 return joints
-        raise InvalidResetError(f"{REDRAWS} random starts around the given joint positions all collide")
+        raise InvalidResetError(f"all {REDRAWS} random starts around the given joint positions collide")
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         self._previous_action = np.zeros(6)
@@ -280,5 +280,5 @@ class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
 
     def __init__(self, *, robot: str = "", **arguments: Any) -> None:
         if not robot:
-            raise ValueError("robot is missing: expected the arm's address, say robot=rtde://192.168.0.2")
+            raise ValueError("robot is missing: expected the arm's address, such as robot=rtde://192.168.0.2")
         super().__init__(robot=robot, **arguments)

@@ -175,7 +175,7 @@ class URSimulation:
         for the gravity of the masses in the data sheet.
         """
         if not 0.0 <= size <= MAX_MODEL_ERROR:
-            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's figures")
+            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's values")
         model, sheet = self.model, self._data_sheet
         masses, inertias = rng.uniform(1.0 - size, 1.0 + size, (2, len(LINKS)))
         gains = rng.uniform(1.0 - size, 1.0 + size, 6)

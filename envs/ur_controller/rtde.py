@@ -188,7 +188,7 @@ class RtdeSession:
     def _take(self, payload: bytes) -> None:
         recipe = payload[0] - 1 if payload else -1
         if not 0 <= recipe < len(self._inputs):
-            raise ValueError(f"data for recipe {recipe + 1}, and there are {len(self._inputs)}")
+            raise ValueError(f"data for recipe {recipe + 1}, but there are {len(self._inputs)}")
         names, layout = self._inputs[recipe]
         if len(payload) - 1 != layout.size:
             raise ValueError(f"{len(payload) - 1} bytes for recipe {recipe + 1}: expected {layout.size}")

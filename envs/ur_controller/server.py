@@ -156,7 +156,7 @@ class ControllerServer:
             try:
                 replies = connection.rtde.receive(data)
             except (ValueError, IndexError) as error:
-                log.warning("a client of RTDE is disconnected: %s", error)
+                log.warning("an RTDE client was disconnected: %s", error)
                 self._drop(connection)
                 return
             if replies:
@@ -174,7 +174,7 @@ class ControllerServer:
             text, connection.text = connection.text.decode(errors="replace"), b""
             self.controller.load_program(text)
         if len(connection.text) > LARGEST_PROGRAM:
-            log.warning("a client of port %d is disconnected: more than %d bytes", connection.port, LARGEST_PROGRAM)
+            log.warning("a client of port %d was disconnected: more than %d bytes", connection.port, LARGEST_PROGRAM)
             self._drop(connection)
 
     def _publish(self) -> None:

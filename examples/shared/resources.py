@@ -58,7 +58,7 @@ def request_of(config: AlgorithmConfig) -> list[dict[str, float]]:
     try:
         factory = cast(Any, config.algo_class).default_resource_request(config.copy(copy_frozen=False))
     except (TypeError, ValueError) as error:
-        raise errors.UsageError(f"the resources asked for are none that RLlib understands: {error}") from error
+        raise errors.UsageError(f"RLlib does not understand the requested resources: {error}") from error
     bundles = [{name: float(amount) for name, amount in bundle.items() if amount} for bundle in factory.bundles]
     if factory.strategy == "STRICT_PACK":
         return [{name: _total(bundles, name) for bundle in bundles for name in bundle}]
@@ -117,12 +117,12 @@ def _fitting(request: Sequence[Bundle], room: Room, at_most: int) -> int:
 
 def _advice(request: Sequence[Bundle], room: Room, name: str, config: AlgorithmConfig | None) -> str:
     if config is None:
-        return "go on where there are as many, or start a new run"
+        return "resume on a machine that has as many, or start a new run"
     if name == "GPU":
         return "leave --num-gpus out to learn on the CPU"
     each: object = config.num_cpus_per_env_runner
     if not isinstance(each, int | float):
-        return "leave the values out that ask for as many"  # it is swept
+        return "leave out the values that ask for so many"  # it is swept
     rest = _total(request, name) - each * (config.num_env_runners or 0)
     if name != "CPU" or not each or rest > room.total(name) + ROUNDING:
         return "ask for fewer learners or evaluation runners, or for less in each process"

@@ -79,9 +79,7 @@ def argument_parser(task: Task, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--num-envs-per-env-runner", type=int, default=8, help="simulators in each sampling process")
     parser.add_argument("--checkpoint-frequency", type=int, default=20, help="iterations between checkpoints")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for results and checkpoints")
-    parser.add_argument(
-        "--resume", type=Path, metavar="RUN", help="go on with a run that was stopped, as it was set up"
-    )
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="resume a stopped run with its own settings")
     return parser
 
 

@@ -112,7 +112,7 @@ def main_with_sentences(main: Callable[[], None], script: str) -> NoReturn:
     try:
         main()
     except InterruptError as stopped:
-        print(f"stopped; go on with: python {script} --resume {stopped.folder}", flush=True)
+        print(f"stopped; continue with: python {script} --resume {stopped.folder}", flush=True)
         sys.exit(INTERRUPTED)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
@@ -202,7 +202,7 @@ def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any]
             ray.shutdown()
             if attempt == attempts - 1:
                 raise errors.RlservoError(f"Ray did not start: {_first_line(error)}") from error
-            print(f"Ray did not start ({_first_line(error)}); once more", file=sys.stderr, flush=True)
+            print(f"Ray did not start ({_first_line(error)}); trying again", file=sys.stderr, flush=True)
 
 
 def _join(address: str, quiet: Mapping[str, Any]) -> None:
@@ -353,7 +353,7 @@ class ProgressTable(tune.Callback):
         count, last = failures.read(self._failures)
         if count > self._failed:
             self._failed, self._told_at = count, time.monotonic()
-            print(f"failed in sampling, {count} so far: {last} (all of them: {self._failures})", flush=True)
+            print(f"failed while sampling, {count} so far: {last} (all of them: {self._failures})", flush=True)
         waited_s = time.monotonic() - self._told_at
         if count and waited_s > failures.BUILT_S and all(trial.status == "PENDING" for trial in trials):
             raise RuntimeError(f"{last}, after which the algorithm was not built")  # RLlib sometimes waits for good
@@ -504,7 +504,7 @@ def resume(folder: Path, *, where: str = "this machine") -> Outcome:
     resources.check_room(run.request, resources.ray_room(where))
     default_config(run.algorithm)  # registers the algorithms, quietly
     if not tune.Tuner.can_restore(str(folder)):
-        raise errors.UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it anew")
+        raise errors.UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it again")
     try:
         tuner = tune.Tuner.restore(str(folder), run.algorithm, resume_unfinished=True, resume_errored=True)
     except Exception as error:  # a damaged or foreign pickle may raise anything
@@ -535,7 +535,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
             cause += f", after an env runner's {last}"
         raise errors.RlservoError(
             f"training failed: {cause}; all of it is in {failed[0].path}/error.txt, and "
-            f"--resume {folder} goes on from the last checkpoint"
+            f"--resume {folder} continues from the last checkpoint"
         )
     if not any(trial.trained_steps for trial in trials):
         raise errors.RlservoError(f"nothing was learned: {failures.nothing_learned(trials[0].env_steps, folder)}")

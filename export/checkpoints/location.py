@@ -153,7 +153,7 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: 
         return alone
     if not (root / MODULES).is_dir():
         if agent_id is not None:
-            raise CheckpointError(f"{root} is of the old API stack, whose policies filter alike for all their agents: "
+            raise CheckpointError(f"{root} is of the old API stack, where all agents of a policy share one filter: "
                                   "leave --agent-id out")  # fmt: skip
         return locate_policy(root, given, module_id)
     if root != given and (root / MODULES) in given.parents and module_id is None:
@@ -269,7 +269,7 @@ def _check_complete(files: CheckpointFiles) -> None:
     if (files.root / TRAINING_RUNNER).is_dir() and files.has_root_pipelines:
         raise CheckpointError(
             f"{files.root} has connectors both in {TRAINING_RUNNER}/ and at its root, saved by two trainings: only one "
-            "of them belongs to the weights; move the other away"
+            "of them belongs to the weights; remove the other"
         )
     if files.has_pipelines:
         needed += pipelines

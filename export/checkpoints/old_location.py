@@ -102,7 +102,7 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
     files = OldStackFiles(root, choose(root, present, policy_id, "policy", "policies"))
     if not files.state.is_file():
         raise UnsupportedError(
-            f"{files.policy} holds its state as msgpack, which is not exported: only {POLICY_STATE}, RLlib's default, "
+            f"{files.policy} holds its state as msgpack, which is not supported: only {POLICY_STATE}, RLlib's default, "
             "is; restore the algorithm with RLlib (and msgpack_numpy) and save it again without msgpack"
         )
     return files

@@ -94,7 +94,7 @@ def _statistics(saved: Mapping[str, Any]) -> Mapping[str, Any]:
         return saved
     if "std_array" not in saved:
         raise UnsupportedError(
-            f"the observation filter's statistics are in a form that is not known: expected 'sum_sq_diff_array' (of "
+            f"the observation filter's statistics are in an unknown form: expected 'sum_sq_diff_array' (of "
             f"an older Ray 'std_array') among {', '.join(saved)}"
         )
     mean, squares = saved["mean_array"], saved["std_array"]

@@ -180,7 +180,7 @@ class _OfElements(ConnectorV2):
         del input_action_space
         space = _check_box(input_observation_space)
         if len(space.shape) != 1 or space.dtype.kind != "f":
-            raise UsageError(f"observations are {space}: {self.WHAT}s are taken of a vector of floating-point numbers")
+            raise UsageError(f"observations are {space}: {self.WHAT}s need a vector of floating-point numbers")
         if wrong := [index for index in self.elements if not 0 <= index < space.shape[0]]:
             raise UsageError(f"{self.WHAT} of element {wrong[0]}: observations have elements 0 to {space.shape[0] - 1}")
         return Box(*self.bounds(space.low, space.high), dtype=space.dtype)
@@ -269,7 +269,8 @@ class FrameStacking(ConnectorV2):
         space = _check_box(input_observation_space)
         if len(space.shape) != 1:
             raise UsageError(
-                f"observations are {space}: frames are stacked of vectors; RLlib's FrameStacking has images"
+                f"observations are {space}: only frames of vectors are stacked here; RLlib's FrameStacking stacks "
+                "images"
             )
         return Box(np.tile(space.low, self.num_frames), np.tile(space.high, self.num_frames), dtype=space.dtype)
 
@@ -373,7 +374,7 @@ def _draws_the_same() -> bool:
 
 def _check_box(space: Any) -> Any:
     if not isinstance(space, Box):
-        raise UsageError(f"observations are {space}: the batched connectors take a Box, RLlib's own take all")
+        raise UsageError(f"observations are {space}: the batched connectors take a Box, RLlib's own take any space")
     return space
 
 

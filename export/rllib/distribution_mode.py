@@ -55,8 +55,8 @@ def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: 
         ) from error
     if not all(torch.equal(one, other) for one, other in zip(first, second, strict=True)):
         raise UnsupportedError(
-            f"the action distribution {name} draws its deterministic action at random: there is no one action to prove "
-            "an export with; its deterministic form has to give the same action each time"
+            f"the action distribution {name} draws its deterministic action at random: an export can only be proven if "
+            "it gives the same action each time"
         )
     if given.shape[-1] != sum(widths):
         return "given"

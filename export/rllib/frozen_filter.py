@@ -27,8 +27,8 @@ def why_untrained(files: Files, recipe: Recipe) -> str:
         return ""
     seen = f"{frozen.count:,} observation{'' if frozen.count == 1 else 's'}"
     if isinstance(files, CheckpointFiles) and files.is_of_evaluation:
-        return f"the observation filter's statistics are of {seen} in evaluation, and of none in training"
+        return f"the observation filter's statistics come from {seen} in evaluation and none in training"
     if frozen.count > 1:
         return ""
     clipped = " and clips" if frozen.clip is not None else ""
-    return f"the observation filter's statistics are of {seen}: RLlib divides by 1e-6{clipped}, unlike in training"
+    return f"the observation filter's statistics come from {seen}: RLlib divides by 1e-6{clipped}, unlike in training"

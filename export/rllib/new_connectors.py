@@ -90,8 +90,8 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: Age
         is_batched = type(piece).__module__ == BATCHED_CONNECTORS  # and batches what was changed before it
         if step is not None and batched_by and not is_batched:
             raise UnsupportedError(
-                f"the env-to-module connector {name} comes after {batched_by}, which has handed the observation on "
-                "already: what RLlib does then depends on the step before, which is not exported"
+                f"the env-to-module connector {name} comes after {batched_by}, which has already passed the "
+                "observation on: what RLlib does then depends on the previous step, which is not exported"
             )
         if is_batched or (name in BATCHES_OBSERVATION and _comes_from_rllib(type(piece))):
             batched_by = name
@@ -210,7 +210,7 @@ def _filter(piece: Any, space: Any, slot: AgentSlot) -> ObservationFilter:
     if isinstance(space, Box) and np.dtype(space.dtype).kind == "u":
         raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib's result has no sign there and wraps")
     if not isinstance(space, Box | MultiBinary):
-        raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib filters single arrays")
+        raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib filters only single arrays")
     if slot.agent not in piece.get_state():
         raise UnsupportedError(
             "MeanStdFilter keeps no statistics for this agent: with several agents RLlib's own pipeline needs "

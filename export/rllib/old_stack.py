@@ -259,8 +259,8 @@ def _check_policy(files: OldStackFiles, policy: Any) -> None:
         )
     if isinstance(policy.exploration, ParameterNoise):
         raise UnsupportedError(
-            f"policy {name} explores with ParameterNoise, and RLlib saves its weights with the noise of that moment in "
-            "them (ray 2.60): they are not those it acts with when it does not explore"
+            f"policy {name} explores with ParameterNoise, and RLlib saves its weights with that moment's noise (ray "
+            "2.60): without exploration it acts with others"
         )
     for key in diverged_weights(policy.model):
         raise CheckpointError(f"{files.state}: the weights '{key}' are not all finite: training diverged")

@@ -68,8 +68,8 @@ def set_saved_state(pipeline: Any, folder: Path) -> None:
     built = {name for name, _ in pipeline.get_checkpointable_components()} - {TIME_AXIS}
     if built != (saved := {child.name for child in folder.iterdir() if child.is_dir()}):
         raise UnsupportedError(
-            f"{folder} holds the connectors {', '.join(sorted(saved))}, and from the checkpoint's configuration follow "
-            f"{', '.join(sorted(built))}: a Ray as early as this one did not save what they are made from"
+            f"{folder} holds the connectors {', '.join(sorted(saved))}, but its configuration gives "
+            f"{', '.join(sorted(built))}: this early Ray did not save their arguments"
         )
     _set_state(pipeline, folder)
 

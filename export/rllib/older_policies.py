@@ -97,7 +97,7 @@ def _worker_filter(files: OldStackFiles) -> dict[str, Any]:
     saved = worker.get("filters", {}).get(files.module_id)
     if saved is None:
         raise UnsupportedError(
-            f"{files.root} does not hold the observation filter's statistics: of a Ray before 2.4 they are in "
+            f"{files.root} does not hold the observation filter's statistics: before Ray 2.4 they are in "
             f"{ALGORITHM_STATE}, beside the policies"
         )
     running = RunningStat(np.shape(saved.running_stats.mean_array))

@@ -156,7 +156,7 @@ def _values(given: Any, joints: Sequence[str], count: int, missing: float, what:
             return [float(found[0]) if found else missing for found in matches]
         if list(given) == [".*"]:
             return [float(given[".*"])] * count
-    raise ValueError(f"has a {what} of single joints ({given}) whose order env.yaml does not tell")
+    raise ValueError(f"has a {what} of single joints ({given}) whose order is not in env.yaml")
 
 
 def _rate(env: Mapping[str, Any]) -> float | None:

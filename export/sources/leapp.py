@@ -90,7 +90,7 @@ def _parameters(file: Path, name: str, model: Mapping[str, Any]) -> Mapping[str,
     parameters = model.get("parameters") or {}
     if parameters.get("backend") != "jit":
         raise UnsupportedError(
-            f"{file}: stage '{name}' is of the backend {parameters.get('backend')!r}: only TorchScript can be traced; "
+            f"{file}: stage '{name}' uses the backend {parameters.get('backend')!r}: only TorchScript can be traced; "
             "export it with export_with='jit-trace'"
         )
     return dict(parameters)

@@ -58,6 +58,6 @@ def find_source(path: Path, name: str | None = None, notify: Notify | None = Non
         raise CheckpointError(f"{given} may be of several sources ({names}): name one with --source")
     if not mine:
         raise CheckpointError(
-            f"{given} is not a checkpoint that any source knows: {'; '.join(f'{s.name}: {s.expects}' for s in known)}"
+            f"{given} is not a checkpoint of any known source: {'; '.join(f'{s.name}: {s.expects}' for s in known)}"
         )
     return mine[0]

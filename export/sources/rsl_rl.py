@@ -54,7 +54,7 @@ class RslRl(Source):
         model = newest_model(given)
         agent = _agent_file(model) if model else None
         if model is None or agent is None:
-            raise CheckpointError(f"{given} is no run of rsl_rl: expected {self.expects}")
+            raise CheckpointError(f"{given} is not a run of rsl_rl: expected {self.expects}")
         environment = agent.with_name(ENVIRONMENT.name)
         files = [model, agent, *([environment] if environment.is_file() else [])]
         return one_policy(model, files, module_id, agent_id)
@@ -112,8 +112,8 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
     if part is None or part not in agent:
         raise UnsupportedError(
             f"{file}: expected the weights and settings of an actor as rsl_rl 5 writes them (actor_state_dict, and "
-            f"'actor' in {agent_file}), got {', '.join(sorted(weights)[:4])}: a run of an older rsl_rl is exported "
-            "after training on, or as a torch module with rlservo.export_policy"
+            f"'actor' in {agent_file}), got {', '.join(sorted(weights)[:4])}: continue a run of an older rsl_rl with "
+            "rsl_rl 5 first, or export its network with rlservo.export_policy"
         )
     state_dict = weights[ACTORS[part]]
     actor, acting = (_actor(file, agent, part, state_dict) for _ in range(2))

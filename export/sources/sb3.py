@@ -74,7 +74,7 @@ class StableBaselines3(Source):
         given = path.expanduser().absolute()
         found = _zips(given)
         if not found:
-            raise CheckpointError(f"{given} is no model of Stable-Baselines3: expected {self.expects}")
+            raise CheckpointError(f"{given} is not a model of Stable-Baselines3: expected {self.expects}")
         if len(found) > 1:
             names = ", ".join(file.name for file in found[:4])
             raise CheckpointError(f"{given} holds {len(found)} models ({names}): name one of them")
@@ -176,8 +176,8 @@ def load_model(file: Path, data: Mapping[str, Any]) -> Any:
     path = algorithm_path(data, policy_class)
     if not path:
         raise UnsupportedError(
-            f"{file}: the policy class {policy_class.__module__}.{policy_class.__qualname__} is of no algorithm of "
-            "Stable-Baselines3 or sb3-contrib that is known here"
+            f"{file}: the policy class {policy_class.__module__}.{policy_class.__qualname__} belongs to no known "
+            "algorithm of Stable-Baselines3 or sb3-contrib"
         )
     module, _, name = path.partition(":")
     unneeded = {

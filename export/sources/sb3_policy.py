@@ -85,7 +85,7 @@ def restore_policy(
     recipe = Recipe(observation_space, policy.action_space, steps, rule.mode, rule.transform, rule.distribution, state)
     untrained = ""
     if (filtered := recipe.filter) is not None and filtered.count <= 1:
-        untrained = f"VecNormalize's statistics are of {filtered.count} observations"
+        untrained = f"VecNormalize's statistics come from {filtered.count} observations"
     kind = type(policy)
     return RestoredPolicy(
         recipe,
@@ -297,7 +297,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     models = _leaves(model_space)
     statistics = _leaves(vec.observation_space) if vec is not None else {}
     if statistics and dict.fromkeys(statistics) != dict.fromkeys(models):
-        raise CheckpointError(f"{file}: VecNormalize's statistics are of the parts {', '.join(statistics)}, the model "
+        raise CheckpointError(f"{file}: VecNormalize's statistics cover the parts {', '.join(statistics)}, the model "
                               f"takes {', '.join(models)}: they do not belong together")  # fmt: skip
     stacked: dict[str, tuple[Any, int]] = {}
     frame_spaces: dict[str, Any] = {}
@@ -313,7 +313,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
         if seen is not None and seen.shape != whole.shape:
             if not _fits(seen.shape, whole.shape, axis) or frames not in (1, whole.shape[axis] // seen.shape[axis]):
                 raise CheckpointError(
-                    f"{file}: VecNormalize's statistics are of observations {seen.shape}, the model's are "
+                    f"{file}: VecNormalize's statistics are for observations {seen.shape}, the model's are "
                     f"{model.shape}: they do not belong together"
                 )
             frames = whole.shape[axis] // seen.shape[axis]
@@ -322,7 +322,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
         stacked[key], transposed = (whole, axis), [*transposed, *([key] if channels_last else [])]
     for key, (whole, axis) in stacked.items():
         if frames > 1 and (not isinstance(whole, Box) or not whole.shape or whole.shape[axis] % frames):
-            raise CheckpointError(f"{file}: {whole} is no stack of {frames} frames")
+            raise CheckpointError(f"{file}: {whole} is not a stack of {frames} frames")
         frame_spaces[key] = whole if frames == 1 else _first_frame(whole, axis, frames)
     is_dict = isinstance(model_space, Dict)
     steps = [Transpose(_leaf(key)) for key in transposed]

@@ -94,7 +94,7 @@ def _check_shape(recipe: Recipe, values: list[NDArray[Any]], rows: int) -> None:
     if got != wanted:
         raise UnsupportedError(
             f"it gives for {rows} observations {which} of shape {', '.join(map(str, got))}, the action space "
-            f"{recipe.action_space} wants {', '.join(map(str, wanted))}"
+            f"{recipe.action_space} expects {', '.join(map(str, wanted))}"
         )
 
 

@@ -70,7 +70,7 @@ class ClientEpisode:
         fields: dict[str, Any] = {}
         if self.is_on_server(contract):
             if self._is_lost:
-                raise SessionLostError("the connection broke, and the episode's memory went with it: call reset()")
+                raise SessionLostError("the connection broke and the episode's memory was lost: call reset()")
             fields["reset"] = self._steps == 0
             if self._session_id is not None:
                 if self._has_unanswered_start:

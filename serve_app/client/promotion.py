@@ -222,7 +222,7 @@ class Promotion:
         """Return which process does not serve what is watched, in a sentence."""
         for name, process in processes.items():
             if process.plan < self._generation:
-                return f"replica '{name}' follows plan {process.plan:g}, and not yet {self._generation}"
+                return f"replica '{name}' follows plan {process.plan:g}, not yet {self._generation}"
             if self._terms.version not in process.versions:
                 return f"replica '{name}' has not loaded version {self._terms.version}"
         return ""
@@ -248,7 +248,7 @@ class Promotion:
         if served is None:
             return f"policy '{terms.policy}' is no longer served"
         if served.production != self._production:
-            what = f"'{PRODUCTION}' leads to {served.production} and no longer to {self._production}"
+            what = f"'{PRODUCTION}' points to {served.production} and no longer to {self._production}"
         elif terms.version not in served.versions:
             what = f"version {terms.version} is no longer loaded"
         elif served.canary != self._canary:
@@ -313,7 +313,7 @@ class Promotion:
         try:
             generation = int(listing["generation"])
             if generation < self._generation:  # of a worker or replica that has not followed yet
-                raise UnavailableError(f"the server follows plan {generation}, and not yet {self._generation}")
+                raise UnavailableError(f"the server follows plan {generation}, not yet {self._generation}")
             self._generation = generation
             policy = next((policy for policy in listing["policies"] if policy["name"] == self._terms.policy), None)
             return policy and _Served(

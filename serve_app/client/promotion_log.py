@@ -46,7 +46,9 @@ class PromotionLog:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                raise UsageError(f"another 'rlservo policy promote' writes {path}: wait for it, or end it") from None
+                raise UsageError(
+                    f"another 'rlservo policy promote' is writing {path}: wait for it, or stop it"
+                ) from None
             file.seek(0)
             try:
                 yield cls(path, file)

@@ -249,8 +249,8 @@ class RemotePolicy(ActingPolicy):
             known = self._fetch_new_version(version, deadline)
             if (known.name, known.version) != (contract.name, version):
                 raise UnavailableError(
-                    f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' and has no contract "
-                    "of it: the action was dropped"
+                    f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' but has no contract "
+                    "for it: the action was dropped"
                 )
             self._learn(known)  # also one that is refused next: it is not fetched again
         self._meet(known)

@@ -40,18 +40,19 @@ def check_successor(contract: Contract, known: Contract) -> None:
         if theirs != ours or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
             differing = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
             raise UnavailableError(
-                f"version {contract.version} of policy '{contract.name}' answers now, whose {word} space is another "
-                f"than that of version {known.version}, which this client knows ({', '.join(differing) or word}): the "
+                f"version {contract.version} of policy '{contract.name}' answers now, and its {word} space differs "
+                "from "
+                f"that of version {known.version}, which this client knows ({', '.join(differing) or word}): the "
                 "action was dropped; make a new client, or one with version=",
                 {"version": contract.version, "known": known.version, "differing": differing},
             )
     has_reward, had_reward = (any(tensor.name == REWARD for tensor in each.inputs) for each in (contract, known))
     if has_reward != had_reward:
-        sees = ("is not given", "is given")
+        takes = ("does not take", "takes")
         raise UnavailableError(
-            f"version {contract.version} of policy '{contract.name}' answers now, which {sees[has_reward]} the "
-            f"reward, and version {known.version}, which this client knows, {sees[had_reward]} it: the action was "
-            "dropped; make a new client, or one with version=",
+            f"version {contract.version} of policy '{contract.name}' answers now and {takes[has_reward]} the reward; "
+            f"version {known.version}, which this client knows, {takes[had_reward]} it: the action was dropped; make a "
+            "new client, or one with version=",
             {"version": contract.version, "known": known.version, "differing": [REWARD]},
         )
 

@@ -187,4 +187,4 @@ def why_interrupted(run: RunFolder) -> str:
     """Return the sentence about a run that was stopped."""
     versions = run.state.versions
     after = f"with version {versions[-1].version}" if versions else "before its first version"
-    return f"stopped {after}; the same command goes on"
+    return f"stopped {after}; the same command continues"

@@ -128,7 +128,7 @@ def _files_of(checkpoint: Path) -> CheckpointFiles:
         )
     if not (files.root / CTOR_FILE).is_file():
         raise UsageError(
-            f"{checkpoint} was pruned, or is a module alone: learning goes on from a whole checkpoint, with its "
+            f"{checkpoint} was pruned, or is a module alone: learning continues from a whole checkpoint, with its "
             "configuration and its optimizer"
         )
     return files
@@ -139,7 +139,7 @@ def _config_of(files: CheckpointFiles) -> AlgorithmConfig:
     algorithm = opened["class"]
     if algorithm.__name__ not in ALGORITHMS:
         raise UnsupportedError(
-            f"{files.root} is of {algorithm.__name__}: online learning knows {', '.join(ALGORITHMS)}; "
+            f"{files.root} is of {algorithm.__name__}: online learning supports {', '.join(ALGORITHMS)}; "
             "examples/learn_from_recordings.py learns offline"
         )
     args, kwargs = opened["ctor_args_and_kwargs"]

@@ -58,7 +58,7 @@ class RunFolder(Closeable):
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.close()
-            raise UsageError(f"--out {path}: another process learns in it") from None
+            raise UsageError(f"--out {path}: another process is learning in it") from None
         try:
             self.state = self._read(terms, reward_source)
         except BaseException:

@@ -162,7 +162,7 @@ class FileReader:
             except RecordingError:
                 raise
             except Exception as error:  # a message that rlservo did not write
-                self._facts.damage = f"read up to a message that cannot be understood: {first_line(error)}"
+                self._facts.damage = f"read up to a message that cannot be decoded: {first_line(error)}"
                 break
             if entry is not None:
                 yield entry

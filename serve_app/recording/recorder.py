@@ -68,7 +68,7 @@ class Recorder(Closeable):
         """
         if max_file_bytes < MIB or max_file_s <= 0 or max_folder_bytes < 2 * max_file_bytes:
             raise UsageError(
-                f"a recording's file has at least {MIB} bytes and its folder room for two, got max_file_bytes "
+                f"a recording's file needs at least {MIB} bytes and its folder room for two, got max_file_bytes "
                 f"{max_file_bytes}, max_file_s {max_file_s:g}, max_folder_bytes {max_folder_bytes}"
             )
         self.path = Path(path)

@@ -106,7 +106,7 @@ class CompiledLibrary:
             self.state_size = ctypes.c_size_t.in_dll(library, f"{prefix}_state_size").value
             self.bundle = ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(library, f"{prefix}_bundle"))).decode()
         except (OSError, AttributeError, ValueError) as error:
-            raise BundleError(f"{file} is no library of a compiled policy: {error}") from error
+            raise BundleError(f"{file} is not a library of a compiled policy: {error}") from error
         self._act.restype, self._act.argtypes = ctypes.c_int32, [ctypes.c_void_p] * 3
         self._element.restype, self._element.argtypes = ctypes.c_char_p, [ctypes.c_int32]
         self._policy = contract.name

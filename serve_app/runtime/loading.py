@@ -224,9 +224,7 @@ def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str,
     except Exception:
         if not options.terminate:
             raise
-        raise BundleError(
-            f"{bundle.path}: the graph did not come to an end within {PROOF_S:g} s on its golden vectors"
-        ) from None
+        raise BundleError(f"{bundle.path}: the graph did not finish its golden vectors within {PROOF_S:g} s") from None
     finally:
         end.cancel()
 
@@ -248,7 +246,8 @@ def check_rows(bundle: Bundle, run: Run) -> None:
             _compare(bundle, name, together, singly, GOLDEN_RTOL, GOLDEN_ATOL)
     except Exception as error:  # onnxruntime's own exceptions share no base but Exception
         raise BundleError(
-            f"{bundle.path}: the graph does not compute three observations as it computes each ({first_line(error)}): "
+            f"{bundle.path}: the graph computes three observations together differently than one by one "
+            f"({first_line(error)}): "
             "leave micro_batch out of the policy's options"
         ) from error
 

@@ -427,7 +427,7 @@ class Policy(Closeable):
                 f"policy '{self._contract.name}' has no action distribution and cannot explore: leave 'explore' out"
             )
         if not self.options.explore:
-            raise RequestError(f"policy '{self._contract.name}' is not to explore on this server: leave 'explore' out")
+            raise RequestError(f"policy '{self._contract.name}' must not explore on this server: leave 'explore' out")
         return distribution
 
     def _sample(self, inputs: NDArray[Any], seed: int | None) -> dict[str, NDArray[Any]]:

@@ -84,8 +84,8 @@ class StateTensors:
         if reward is None:
             start = "" if self._specs else ", 0 at an episode's start"
             raise RequestError(
-                f"policy '{self._policy}' was trained to see the reward of its last action: give "
-                f"act(obs, reward=...), over a network 'reward'{start}"
+                f"policy '{self._policy}' was trained to see the reward of its last action: pass "
+                f"act(obs, reward=...), in a request 'reward'{start}"
             )
         array = parse_array(reward, "float32", f"the reward for policy '{self._policy}'").reshape(-1)
         if len(array) != rows or not np.isfinite(array).all():
