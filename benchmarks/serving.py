@@ -1,8 +1,8 @@
-"""Serving speed beside other servers: start, memory, latency, throughput, robots at a fixed rate, WebSocket.
+"""Serving speed compared with other servers: start, memory, latency, throughput, robots at a fixed rate, WebSocket.
 
-    python benchmarks/serving.py --install     # once: the peers' environments; what is not installed is left out
-    python benchmarks/serving.py               # six minutes; run again, it goes on where it stopped
-    python benchmarks/serving.py --publish     # the same, and writes benchmarks/results/serving.md
+    python benchmarks/serving.py --install     # once: the peers' environments; servers that are not installed are left
+    out python benchmarks/serving.py               # six minutes; a second run continues python benchmarks/serving.py
+    --publish     # the same, and writes benchmarks/results/serving.md
 
 One server runs at a time. Rounds alternate between all servers, and what is compared with bare uvicorn is a ratio
 within one round: a machine's speed drifts by more than servers differ.
@@ -47,7 +47,7 @@ END_S = 20.0  # [s] for a server to end
 QUIET = 0.5  # load average above which the figures are of a busy machine
 
 Row = dict[str, Any]
-# Goals of ours beside bare uvicorn: at most, or at least, this ratio.
+# Our goals compared with bare uvicorn: at most, or at least, this ratio.
 GOALS = {
     "one.p50": ("1 connection, p50", 1.2),
     "sixteen.per_second": ("16 connections, requests/s", 0.65),
@@ -281,7 +281,7 @@ def report(rows: list[Row]) -> str:
         return "\n".join(lines) + "\n"
     lines += [
         "",
-        f"`{OURS}` beside {BARE}, medians of the ratios within a round:",
+        f"`{OURS}` against {BARE}, medians of the ratios within a round:",
         "",
         "| | ratio | goal |",
         "|---|---|---|",

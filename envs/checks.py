@@ -26,7 +26,7 @@ def element(name: str, unit: str) -> ElementInfo:
 
 
 class EnvDescription(TypedDict):
-    """What `Env.describe(**constructor_arguments)` returns without building the environment.
+    """Result of `Env.describe(**constructor_arguments)`, which builds no environment.
 
     The exporter writes it into the policy's contract; any environment may offer the same classmethod.
     """

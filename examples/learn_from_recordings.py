@@ -4,7 +4,7 @@
 
 Recordings (`rlservo rollout --record`, `WithRecording`, clients) become RLlib's episodes: actions as the module gave
 them, before unsquash and clip; observations through the checkpoint's own connectors, filters as they stand. BC, MARWIL,
-CQL and IQL learn from whole episodes, starting at the checkpoint's weights where the algorithm has such a network. The
+CQL and IQL learn from whole episodes, starting at the checkpoint's weights if the algorithm has such a network. The
 result is a checkpoint that `rlservo export` takes. Without `--from` the network is new, and so is its observation
 filter: of the recorded observations. docs/how-to/learn.md has the whole path.
 """
@@ -57,7 +57,7 @@ ALGORITHMS = ("BC", "MARWIL", "CQL", "IQL")
 
 @dataclass(frozen=True)
 class Start:
-    """What the next version has from the last one, or what a new one begins with."""
+    """Parts that the next version takes from the last one, or a new one's initial ones."""
 
     env_to_module: Any
     module_to_env: Any
@@ -147,7 +147,7 @@ def start_anew(config: AlgorithmConfig, recorded: Recorded, with_filter: bool) -
 def module_spec(config: AlgorithmConfig, start: Start, longest: int) -> tuple[RLModuleSpec | None, str]:
     """Return the module that an algorithm learns, None for its own new one, and a sentence about it.
 
-    BC and MARWIL go on with any network that has a value function, CQL and IQL with SAC's. A recurrent module learns
+    BC and MARWIL continue with any network that has a value function, CQL and IQL with SAC's. A recurrent module learns
     from whole episodes: its sequences are as long as the longest.
     """
     module = start.module
@@ -164,7 +164,7 @@ def module_spec(config: AlgorithmConfig, start: Start, longest: int) -> tuple[RL
     )
     if module.is_stateful():
         settings["max_seq_len"] = longest
-    if not actor_critic:  # the learner's own class has more heads than SAC's; those begin anew
+    if not actor_critic:  # the learner's own class has more heads than SAC's; those start untrained
         default = cast(RLModuleSpec, config.get_default_rl_module_spec())
         spec.module_class, spec.catalog_class = default.module_class, default.catalog_class
     spec.model_config = settings
@@ -253,7 +253,7 @@ def report(recorded: Recorded) -> None:
     for reason, count in recorded.not_used.items():
         print(f"not used: {count} episodes {reason}")
     print(
-        f"own actions: {recorded.own} recorded, {recorded.inverted} computed from what was executed, of which "
+        f"own actions: {recorded.own} recorded, {recorded.inverted} computed from the executed ones, of which "
         f"{recorded.clipped} at a bound (the true ones may lie beyond it)",
         flush=True,
     )

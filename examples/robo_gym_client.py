@@ -8,7 +8,7 @@
 robo-gym pins an old protobuf, so it cannot share an environment with Ray: docs/how-to/robo-gym.md says how to make its
 own, and what must be done before `--rs-address` drives a real robot.
 
-Standard output has the report only: what robo-gym prints goes to standard error. Exit codes: 0, 1 for what failed, 2
+Standard output has the report only: robo-gym's own output goes to standard error. Exit codes: 0, 1 for a failure, 2
 for a wrong argument, 130 for Ctrl-C, after which no simulator is left.
 """
 
@@ -39,7 +39,7 @@ POLICIES = {
     "ObstacleAvoidanceMir100": "mir100_obstacle_avoidance",
 }
 UR_MODELS = ("ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e")
-MANAGER_PORTS = range(50100, 50200)  # where robo-gym looks for a server manager
+MANAGER_PORTS = range(50100, 50200)  # robo-gym looks for a server manager here
 ANSWER_S = 5.0  # [s] to connect, and again to answer; robo-gym itself waits 20 s for each of a hundred ports
 VERIFY = "/robo_gym_server_manager.grpc_msgs.server_manager.ServerManager/VerifyConnection"
 GET_STATE = "/robot_server.RobotServer/GetState"
@@ -156,7 +156,7 @@ def answers(host: str, port: int, method: str) -> bool:
         socket.create_connection((host, port), timeout=ANSWER_S).close()
     except ConnectionRefusedError:
         return False
-    except (OSError, UnicodeError) as error:  # the other ports of this host would tell the same, each as slowly
+    except (OSError, UnicodeError) as error:  # the other ports of this host would fail the same way, each as slowly
         raise errors.UnavailableError(f"{host}:{port} cannot be reached: {error}") from error
     ask_directly(host)
     with grpc.insecure_channel(f"[{host}]:{port}" if ":" in host else f"{host}:{port}") as channel:

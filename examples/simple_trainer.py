@@ -6,7 +6,7 @@
     python examples/simple_trainer.py --resume runs/PPO-CartPole-v1-20260101-120000
 
 `--num-cpus N` is N cores for env runners, one each, and one more core for the driver, which holds the learner: on a
-node of 36 cores, `--num-cpus 35`. Where the machine has just N cores, the driver shares them (it waits while the others
+node of 36 cores, `--num-cpus 35`. If the machine has just N cores, the driver shares them (it waits while the others
 sample). `--num-cpus 0` samples in the driver. The run ends in a bundle that `rlservo serve` can serve.
 """
 
@@ -69,7 +69,7 @@ OLD_ARGUMENTS = {
     "--local-dir": "--storage",
     "--restore": "--resume",
 }
-AFTER_RESUME = ("resume", "address")  # what may be said beside --resume; everything else is the saved run's
+AFTER_RESUME = ("resume", "address")  # allowed with --resume; everything else is the saved run's
 
 
 def argument_parser() -> argparse.ArgumentParser:
@@ -299,7 +299,7 @@ def algorithm_config(
 
 
 def observation_steps(space: Any, kind: str) -> Any:
-    """Return RLlib's connectors between environment and network, or None where it needs none.
+    """Return RLlib's connectors between environment and network, or None if it needs none.
 
     What is flattened is made one vector: choices one-hot, Dict and Tuple in the space's order, images pixel by pixel.
     uint8 is not scaled.
@@ -320,7 +320,7 @@ def observation_steps(space: Any, kind: str) -> Any:
 
 
 def is_flattened(space: Any) -> bool:
-    """Whether the network is to see a vector: all but a vector, and an image of a size RLlib has convolutions for."""
+    """Whether the network sees a vector: all but a vector, and an image of a size RLlib has convolutions for."""
     return not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
 
 

@@ -34,7 +34,7 @@ EXPLORATION_STEPS = 5_000  # steps on FrozenLake, after which it hardly explores
 
 @dataclass(frozen=True)
 class Settings:
-    """How long everything takes."""
+    """Durations of the tour's parts."""
 
     out: Path
     quick: bool
@@ -64,14 +64,14 @@ def main() -> None:
         for stop in args.stops or stops:
             stops[stop](settings)
     except training_run.InterruptError:
-        raise KeyboardInterrupt from None  # a tour begins anew
+        raise KeyboardInterrupt from None  # a tour cannot be resumed
 
 
 def heading(text: str) -> None:
     print(f"\n=== {text}", flush=True)
 
 
-# What every environment gets.
+# Arguments of every environment.
 
 
 def look_at(env_id: str, **arguments: Any) -> None:
@@ -279,7 +279,7 @@ def frozen_lake(settings: Settings) -> None:
     log.mkdir(parents=True)
     config.debugging(seed=1)
     with training_run.ray_session(num_cpus=1), training_run.stopping(training_run.build(config)) as algorithm:
-        steps, is_solved = 0, False  # one episode tells: without slipping, every episode of a policy is the same
+        steps, is_solved = 0, False  # one episode is enough: without slipping, every episode of a policy is the same
         while not (is_solved and (settings.quick or steps >= EXPLORATION_STEPS)) and steps < 4 * EXPLORATION_STEPS:
             result = training_run.iterate(algorithm)
             steps = result[STEPS]

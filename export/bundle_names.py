@@ -27,7 +27,7 @@ def default_name(env_id: str | None, env_config: Mapping[str, Any], root: Path) 
 
 
 def bundle_name(base: str, module_id: str, agent_id: str | None) -> str:
-    """Return the name of one policy of several: what is not allowed in a name becomes '-'."""
+    """Return the name of one policy of several; characters that a name may not have become '-'."""
     parts = [base, module_id, *([agent_id] if agent_id else [])]
     return re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts))[:64].rstrip("-.")
 

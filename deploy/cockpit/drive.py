@@ -1,6 +1,6 @@
 """The drive: a thread in which a policy drives a simulated robot in real time, and a second version its ghost.
 
-Whoever draws it reads `view`, `history` and `notes`, which are replaced as a whole, and asks for changes with `do`:
+The page reads `view`, `history` and `notes`, which are replaced as a whole, and asks for changes with `do`:
 they are made between two control cycles. It knows nothing of pages and browsers.
 """
 
@@ -74,7 +74,7 @@ class Drive:
         self._ghost: Ghost | None = None
         self._commands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._dragged: dict[Callable[[Vector], None], Vector] = {}  # what was dragged, and has not been put there yet
+        self._dragged: dict[Callable[[Vector], None], Vector] = {}  # dragged, but not moved yet
         self._thread = threading.Thread(target=self._run, name="cockpit-drive", daemon=True)
         self._phase: Phase = "driving"
         self._start: Start = "own"
@@ -132,7 +132,7 @@ class Drive:
             self.pause()
 
     def begin(self, start: Start, *, keep_target: bool = False) -> None:
-        """Begin an episode now; later ones that do not continue from where the robot is start alike."""
+        """Begin an episode now; later ones that do not continue from the robot's pose start the same way."""
         if start != "here":
             self._start = start
         self._is_users_target = self._is_users_target and keep_target
@@ -358,7 +358,7 @@ class Drive:
         self._sentence = f"Episode {self._episodes + 1} runs."
 
     def _end(self, info: Mapping[str, Any], *, is_arrival: bool) -> None:
-        """Count an episode, and say how it continues: from where the robot is, but after a failure."""
+        """Count an episode and report it; the next one continues from the robot's pose, except after a failure."""
         is_success, status = bool(success_of(info)), info.get("final_status")
         self._episodes += 1
         self._successes += is_success
@@ -413,7 +413,7 @@ class Drive:
         return [self._stage] if self._ghost is None else [self._stage, self._ghost.stage]
 
     def _stage_for(self, contract: Contract, choice: Choice, arguments: Mapping[str, Any] | None) -> Stage:
-        """Return the stage that is there where a policy fits it, else a new one."""
+        """Return the present stage if the policy fits it, else a new one."""
         if arguments is None:
             if choice.name == self._choice.name:
                 self._stage.check(contract)

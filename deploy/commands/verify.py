@@ -144,7 +144,7 @@ def _verify_against(
 def _verify_compiled(
     compiled: Path, bundle: Path, env_id: str | None, episodes: int, seed: int, env_arg: list[str], as_json: bool
 ) -> dict[str, Any]:
-    """Drive the environment with the bundle and with its C. Raises ParityError where an episode ends otherwise."""
+    """Drive the environment with the bundle and with its C. Raises ParityError if an episode ends differently."""
     if env_id is None:
         raise UsageError("--compiled needs --env: the environment to drive")
     with needs_extra("sim", "gymnasium"):

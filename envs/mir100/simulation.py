@@ -70,8 +70,8 @@ class Mir100Simulation:
         self._cubes = list(self.world.cubes)
         self._command = (0.0, 0.0)  # [m/s], [rad/s], the last one, within the velocity limits
         self._command_age = 0  # substeps
-        self._setpoint = (0.0, 0.0)  # [m/s], [rad/s], what the wheels are told: follows within the acceleration limits
-        self._velocity_factors = (1.0, 1.0)  # what the wheels make of a command, ahead and turning
+        self._setpoint = (0.0, 0.0)  # [m/s], [rad/s], the wheels' setpoint: follows within the acceleration limits
+        self._velocity_factors = (1.0, 1.0)  # the wheels' error in a command, ahead and turning
         self._body = self.model.body("base_link").id
         self._data_sheet = (
             float(self.model.body_mass[self._body]),
@@ -196,7 +196,7 @@ class Mir100Simulation:
             if data.ncon:
                 in_contact = True
         self._setpoint = (linear, angular)
-        # mj_step leaves poses and contacts of its start: bring them up to where the robot is now.
+        # mj_step leaves the poses and contacts of its start: update them to the present state.
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         self.in_collision = in_contact or data.ncon > 0

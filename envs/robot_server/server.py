@@ -31,7 +31,7 @@ from rlservo.envs.robot_server.settings import Settings, URSettings, settings_fr
 THREADS = 8  # calls at a time; one of them moves the robot
 OPTIONS = [("grpc.so_reuseport", 0)]  # gRPC's default lets two servers share a port, and clients meet either
 WATCH_INTERVAL_S = 2.0
-READY = "ready on port "  # what a manager waits for on standard output
+READY = "ready on port "  # a manager waits for this on standard output
 FAILED = "failed: "  # or this, and the reason
 
 log = logging.getLogger("rlservo.robot_server")
@@ -84,7 +84,7 @@ def bind(server: grpc.Server, host: str, port: int) -> int:
     try:
         return int(server.add_insecure_port(address))
     except RuntimeError as error:
-        _probe(host, port, address)  # what was missing may be missing still: a file descriptor, say
+        _probe(host, port, address)  # a resource may still be missing: a file descriptor, say
         if port:
             raise PortInUseError(f"cannot listen on {address}: the port is taken") from error
         raise CannotListenError(f"cannot listen on {address}: gRPC failed without a reason") from error
@@ -124,7 +124,7 @@ def stop_signals() -> queue.SimpleQueue[int]:
 def arrives(signals: queue.SimpleQueue[int], timeout_s: float | None = None) -> bool:
     """Wait for a signal, indefinitely without a time; return whether one has come.
 
-    A wait without an end is one of many seconds: what comes a moment before it begins, or to another thread, interrupts
+    An endless wait is split into long ones: a signal that comes just before it begins, or to another thread, interrupts
     nothing, and its handler would not run until something did.
     """
     while True:
@@ -167,7 +167,7 @@ def main(argv: list[str]) -> None:
 
     def ready(port: int) -> None:
         _say(f"{READY}{port}")
-        # Nobody reads on: what a library prints from now on goes nowhere instead of into a full pipe.
+        # The pipe is no longer read: later prints of libraries are discarded instead of filling it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     try:

@@ -66,7 +66,7 @@ class URRobot:
         return RobotState(values=list(names.values()), names=names)
 
     def set_state(self, target: RobotState) -> int:
-        """Put the arm where the state says, set the objects going, and let 20 cycles pass."""
+        """Put the arm at the state's pose, start the objects' motions, and let 20 cycles pass."""
         joints = self._target_joints(target)
         floats = {**self._float_params, **target.float_params}
         strings = {**self._string_params, **target.string_params}
@@ -84,7 +84,7 @@ class URRobot:
         return SETTLE_CYCLES
 
     def act(self, action: Sequence[float]) -> None:
-        """Send the arm towards six joint positions, or by six offsets from where it is [rad], for one cycle."""
+        """Send the arm towards six joint positions, or by six offsets from its own [rad], for one cycle."""
         if len(action) != 6:
             raise ValueError(f"the action has {len(action)} elements, expected 6: {', '.join(ROS_JOINTS)} [rad]")
         for joint, value in zip(ROS_JOINTS, action, strict=True):
@@ -99,7 +99,7 @@ class URRobot:
         self.simulation.advance()
 
     def idle(self, cycles: int) -> None:
-        """Stop the arm where it is and let cycles pass."""
+        """Stop the arm in place and let cycles pass."""
         self.simulation.hold()
         for _ in range(cycles):
             self.simulation.advance()

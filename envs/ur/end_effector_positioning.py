@@ -161,7 +161,7 @@ class EndEffectorPositioningURSim(URArmEnv):
     # -- for viewers
 
     def target_position(self) -> Vector:
-        """Return where the target is in MuJoCo's world [m] (3,)."""
+        """Return the target's position in MuJoCo's world [m] (3,)."""
         return self._target + BASE
 
     def move_target(self, position: ArrayLike) -> None:
@@ -170,7 +170,7 @@ class EndEffectorPositioningURSim(URArmEnv):
         self.simulation.place_object(0, self._target)
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
-        """Return the options of an episode that starts as asked for, the target where it is with `keep_target`."""
+        """Return the options of an episode with the requested start; `keep_target` leaves the target in place."""
         options: dict[str, Any] = {"ee_target_pose": [*self._target.tolist(), 0.0, 0.0, 0.0]} if keep_target else {}
         if start == "here":
             joints = np.clip(self.simulation.joint_positions, -LIMITS, LIMITS)
@@ -184,7 +184,7 @@ class EndEffectorPositioningURSim(URArmEnv):
         return {**super().start_at(position), "randomize_start": False}
 
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
-        """Put arm and target where an observation has them."""
+        """Put arm and target at the poses of an observation."""
         self.simulation.place(observations[row, 3:9] * LIMITS)
         self.move_target(observations[row, 15:18] + BASE)
 
@@ -251,7 +251,7 @@ class EndEffectorPositioningURSim(URArmEnv):
     def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
         self._previous_action = command  # after the observation: robo-gym's order, see the data sheet
         distance = float(observation[0])
-        if self._base_offset.any():  # what is told is not where it is
+        if self._base_offset.any():  # the reported position is wrong
             distance = math.dist(self._target, self.simulation.tool_position)
         if self.simulation.in_collision:
             return -1.0, "collision"

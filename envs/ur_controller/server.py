@@ -1,7 +1,8 @@
 """Ports of the simulated controller, its clock, and the faults of the link to it.
 
 One loop in one thread: sockets while a control cycle's time has not come, then the cycle. Time is the wall clock's.
-Where the machine holds the loop up, the cycles are made good at once, and the watchdog does not blame the client.
+If the machine delays the loop, the cycles are caught up at once, and the watchdog does not count the delay against the
+client.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class ControllerServer:
         self._rng = np.random.default_rng(seed)
         self._in_use: dict[str, RtdeSession] = {}
         self._connections: dict[socket.socket, _Connection] = {}
-        self._waiting: list[tuple[float, int, Callable[[], None]]] = []  # what the link holds back, by due time
+        self._waiting: list[tuple[float, int, Callable[[], None]]] = []  # data that the link delays, by due time
         self._count = 0
         self._asked: list[Callable[[], object]] = []
         self._listeners: dict[socket.socket, int] = {}

@@ -1,7 +1,7 @@
 """Resources of a training run: refuse what cannot be had before anything starts, and name what is waited for.
 
-RLlib's processes are bundles of CPUs and GPUs, each of which must fit one machine. Ray waits for ever, and without a
-word, for those that fit nowhere (ray 2.60).
+RLlib's processes are bundles of CPUs and GPUs, each of which must fit one machine. Ray waits indefinitely, and without
+a word, for those that fit nowhere (ray 2.60).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rlservo import errors
 assert ray_settings
 Bundle = Mapping[str, float]  # resource -> amount, of one process
 SAID_AFTER_S, SAID_AGAIN_S, POLL_S = 10.0, 60.0, 1.0
-# Where Ray's autoscaler, its cluster launcher or KubeRay started a node: more may come.
+# Set if Ray's autoscaler, its cluster launcher or KubeRay started a node: more may come.
 NODE_GROUP = "ray.io/node-group"
 ROUNDING = 1e-6
 
@@ -169,7 +169,7 @@ def _watch(done: threading.Event) -> None:
     printed_at: dict[str, float] = {}  # line -> when it was printed
     while not done.wait(POLL_S):
         try:
-            # A group's id ends with that of the job it belongs to; others' on the cluster are not ours to tell.
+            # A group's id ends with that of the job it belongs to; other jobs' are not ours to report.
             ours = {key: group for key, group in placement_group_table().items() if key.endswith(job)}
             pending = {key for key, group in ours.items() if group["state"] in ("PENDING", "RESCHEDULING")}
             now = time.monotonic()
@@ -179,7 +179,7 @@ def _watch(done: threading.Event) -> None:
                 continue
             runs = any(group["state"] == "CREATED" for group in ours.values())
             line = _waiting_line(list(ours[long[0]]["bundles"].values()))
-        except Exception:  # Ray is ending, or its head is away: whoever trains says so
+        except Exception:  # Ray is shutting down, or its head is unreachable: the training reports it
             continue
         if line not in printed_at or (not runs and now - printed_at[line] >= SAID_AGAIN_S):
             printed_at[line] = now

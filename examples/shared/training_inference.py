@@ -30,7 +30,7 @@ SUPPORTED = ("PPO", "APPO", "IMPALA", "SAC")
 
 @dataclass(frozen=True)
 class Task:
-    """What one of the two scripts trains, and the settings that were found to work."""
+    """Task of one of the two scripts, with settings that were found to work."""
 
     env_id: str
     env_config: dict[str, Any]
@@ -147,7 +147,7 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
 
 
 def run(task: Task, parser: argparse.ArgumentParser) -> None:
-    """Parse the command line, train (or go on), and run inference episodes with the best checkpoint."""
+    """Parse the command line, train (or resume), and run inference episodes with the best checkpoint."""
     args = parser.parse_args()
     check_arguments(parser, args)
     gpus = gpus_asked_for(parser)

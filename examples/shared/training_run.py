@@ -66,7 +66,7 @@ class InterruptError(Exception):
 
 @dataclass(frozen=True)
 class Run:
-    """A training run: what to resume it with, and what decides which checkpoint is best."""
+    """A training run: how to resume it, and the metric of its best checkpoint."""
 
     algorithm: str
     env_id: str
@@ -87,7 +87,7 @@ class Trial:
     settings: dict[str, Any]  # the swept ones
     iterations: int
     env_steps: int
-    trained_steps: float  # what the learner has seen of them, each as often as it was seen
+    trained_steps: float  # steps that the learner has seen, repetitions counted
     score: float  # the last one reported
     best_score: float
     best_checkpoint: Path | None
@@ -97,7 +97,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run left: its trials, the best one first."""
+    """Outcome of a run: its trials, the best one first."""
 
     folder: Path
     trials: tuple[Trial, ...]
@@ -154,9 +154,11 @@ def ray_session(
 
     Raises UsageError when the cluster cannot be reached.
     """
-    told = log_level in ("DEBUG", "INFO")
-    quiet: dict[str, Any] = {"log_to_driver": told, "logging_level": logging.INFO if told else logging.ERROR}
-    logging.getLogger("ray.tune").setLevel(logging.INFO if told else logging.CRITICAL)  # the cause is told at the end
+    is_verbose = log_level in ("DEBUG", "INFO")
+    level = logging.INFO if is_verbose else logging.ERROR
+    quiet: dict[str, Any] = {"log_to_driver": is_verbose, "logging_level": level}
+    # The cause of a failed trial is reported at the end.
+    logging.getLogger("ray.tune").setLevel(logging.INFO if is_verbose else logging.CRITICAL)
     logging.getLogger("tensorboardX").setLevel(logging.ERROR)  # it warns of a return that is -inf (`fill_return`)
     folder: str | None = None
     own = str((app_dir or Path()).resolve())
@@ -232,7 +234,7 @@ def local_gpus() -> float:
 
 @contextlib.contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
-    """Let SIGTERM do what Ctrl-C does; gives the function that says so again."""
+    """Let SIGTERM do what Ctrl-C does; returns the function that installs it again."""
 
     def forward(number: int, frame: FrameType | None) -> None:
         handler = signal.getsignal(signal.SIGINT)  # Tune's while it runs, Python's otherwise
@@ -293,13 +295,13 @@ def stopping(algorithm: Any) -> Iterator[Any]:
 
 
 def pickle_by_value(*modules: ModuleType) -> None:
-    """Let checkpoints load, and other nodes run, where the scripts' own files do not exist."""
+    """Let checkpoints load, and other nodes run, without the scripts' own files."""
     for module in (sys.modules[__name__], failures, *modules):
         cloudpickle.register_pickle_by_value(module)
 
 
 def log_success(*, episode: Any, metrics_logger: Any, **_: Any) -> None:
-    """RLlib's callback at an episode's end: the share of successes, where the environment says so in `info`."""
+    """RLlib's callback at an episode's end: the share of successes, if the environment reports it in `info`."""
     info = episode.get_infos(-1) or {}
     if "is_success" in info:
         metrics_logger.log_value("success_rate", float(info["is_success"]), reduce="mean", window=100)
@@ -403,7 +405,7 @@ def train(
 ) -> Outcome:
     """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised.
 
-    `resumable` is whether the script has a `--resume`, which it then tells of; `where` is what Ray runs on, in words.
+    `resumable` is whether the script has a `--resume` to mention; `where` describes what Ray runs on.
     """
     run = replace(run, request=run.request or resources.request_of(config))
     resources.check_room(run.request, resources.ray_room(where), config=config, concurrent=max_concurrent)
@@ -412,7 +414,7 @@ def train(
     (folder / RUN_FILE).write_text(json.dumps(asdict(run) | {"swept": list(swept)}, indent=2) + "\n")
     failures.watch(config, folder)
     print(f"run: {folder}\ncurves: tensorboard --logdir {folder}", flush=True)
-    print("Ctrl-C stops" + (f"; --resume {folder} goes on" if resumable else ""), flush=True)
+    print("Ctrl-C stops" + (f"; --resume {folder} continues" if resumable else ""), flush=True)
     tuner = tune.Tuner(
         run.algorithm,
         param_space=cast(Any, config),  # Tune takes an AlgorithmConfig, its annotation says dict
@@ -479,7 +481,7 @@ def _trial_name(trial: Any) -> str:
 def load_run(folder: Path) -> tuple[Run, list[str]]:
     """Return what `run.json` of a run's folder says, and the names of the swept settings.
 
-    Raises UsageError when the folder is no run.
+    Raises UsageError if the folder is not a run.
     """
     try:
         document = json.loads((folder / RUN_FILE).read_text())
@@ -494,9 +496,9 @@ def load_run(folder: Path) -> tuple[Run, list[str]]:
 
 
 def resume(folder: Path, *, where: str = "this machine") -> Outcome:
-    """Go on with a run that was interrupted or failed, each trial from its newest checkpoint (Ray must be running).
+    """Resume a run that was interrupted or failed, each trial from its newest checkpoint (Ray must be running).
 
-    Raises UsageError when the folder is no run, or there is not the room that it needs, Interrupted on Ctrl-C and
+    Raises UsageError if the folder is not a run or the resources do not suffice, Interrupted on Ctrl-C and
     RlservoError when a trial fails.
     """
     folder = folder.expanduser().resolve()

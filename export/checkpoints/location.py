@@ -56,7 +56,7 @@ class CheckpointFiles:
 
     @property
     def is_one_of_several(self) -> bool:
-        """Whether the policy goes by an id of its own, and may have others next to it."""
+        """Whether the policy has an id of its own, and may have others next to it."""
         return self.module_id != DEFAULT_POLICY and (self.part or not self.alone)
 
     @property
@@ -80,7 +80,7 @@ class CheckpointFiles:
 
     @property
     def has_pipelines(self) -> bool:
-        """Whether the checkpoint holds the connector pipelines, with what they have learned.
+        """Whether the checkpoint holds the connector pipelines with their learned statistics.
 
         An environment runner that talks to an environment elsewhere has none.
         """
@@ -88,7 +88,7 @@ class CheckpointFiles:
 
     @property
     def is_of_evaluation(self) -> bool:
-        """Whether only evaluation has filled what the connector pipelines have learned."""
+        """Whether only evaluation has filled the statistics of the connector pipelines."""
         return self.runner == self.root / EVALUATION_RUNNER
 
     @property
@@ -112,7 +112,7 @@ class CheckpointFiles:
 
     @property
     def together(self) -> Path:
-        """The file that says of which class the modules are parts."""
+        """The file that names the class which the modules are parts of."""
         return self.root / MODULES / CTOR_FILE
 
     def sha256(self) -> str:

@@ -31,7 +31,7 @@ class OldStackFiles:
     api_stack: ClassVar[Literal["old"]] = "old"
 
     root: Path
-    """The algorithm checkpoint; the policy's own folder where that is all there is."""
+    """The algorithm checkpoint, or the policy's own folder if there is nothing else."""
     module_id: str
     """The policy's id, under the name the rest of the exporter has for it."""
 
@@ -41,7 +41,7 @@ class OldStackFiles:
 
     @property
     def is_one_of_several(self) -> bool:
-        """Whether the policy goes by an id of its own, and may have others next to it."""
+        """Whether the policy has an id of its own, and may have others next to it."""
         return self.policy != self.root and self.module_id != DEFAULT_POLICY
 
     @property
@@ -96,7 +96,7 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
     """
     present = policy_ids(root)
     if not present:
-        present = [policy_id or root.name]  # a policy's folder on its own, which does not tell its id
+        present = [policy_id or root.name]  # a policy's folder on its own, which does not name its id
     elif given.parent == root / POLICIES and policy_id is None:
         policy_id = given.name
     files = OldStackFiles(root, choose(root, present, policy_id, "policy", "policies"))

@@ -46,7 +46,7 @@ class Gone:
 
 
 def find_class(find: Callable[[str, str], Any], module: str, name: str, *, missing_ok: bool) -> Any:
-    """Return what a pickle names, which `find` looks up where it is now.
+    """Return the object that a pickle names; `find` looks it up at its present place.
 
     With `missing_ok` a `Gone` stands for what Ray and gym no longer have. Raises ImportError or AttributeError.
     """

@@ -1,7 +1,7 @@
 """Download a checkpoint from any URI that Ray itself reads into a temporary folder, removed afterwards.
 
 Like Ray's own storage it asks pyarrow first (`file://`, `s3://`, `gs://`, `hdfs://`) and then fsspec (`memory://`,
-`abfs://`, `http://`, ... where the package of that protocol is installed).
+`abfs://`, `http://`, ... if the package of that protocol is installed).
 """
 
 from __future__ import annotations

@@ -304,7 +304,7 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
 
 
 def write_contract(folder: Path, contract: Contract) -> None:
-    """Write contract.json and, with it, SHA256SUMS over all four files, of which the other three must exist.
+    """Write contract.json and, with it, SHA256SUMS over all four files; the other three must exist.
 
     Both are written next to the old ones and then take their names: whatever fails before leaves the bundle as it was.
     """

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, field_validator
 from rlservo.export.contract.errors import BundleError
 from rlservo.export.contract.spaces import FrozenModel, Shape, Size, SpaceSpec
 
-VALUE = "value"  # the graph's output of the value head, where it was exported
+VALUE = "value"  # the graph's output of the value head, if it was exported
 REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"

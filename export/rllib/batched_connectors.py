@@ -1,7 +1,7 @@
 """RLlib's default connectors for one agent, as pieces that take all environments of a runner at once.
 
 RLlib (2.60) passes each environment's observation and action through ten pieces, one by one and each timed, which takes
-as long as the simulator or longer. These give the same numbers, bit by bit. They do where an observation is a Box, an
+as long as the simulator or longer. These give the same numbers, bit by bit. They work if an observation is a Box, an
 action a Box, Discrete or MultiDiscrete, and the network has no memory:
 
     use_batched_connectors(config, observation_filter=True)
@@ -83,7 +83,7 @@ def use_batched_connectors(
 
 
 def supports(observation_space: Any, action_space: Any) -> bool:
-    """Whether these pieces do for an agent with such spaces, if its network has no memory."""
+    """Whether these pieces suit an agent with such spaces, if its network has no memory."""
     return isinstance(observation_space, Box) and isinstance(action_space, Box | Discrete | MultiDiscrete)
 
 
@@ -132,7 +132,7 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
             if self._update_stats:
                 _push(running.running_stats, row)
             row = _filtered(row, running)
-            episode.observations.data[-1] = row  # what the learner is to see
+            episode.observations.data[-1] = row  # the learner sees this
             if episode.observation_space is not self.observation_space:
                 episode.observation_space = self.observation_space
             rows.append(row)
@@ -204,7 +204,7 @@ class _OfElements(ConnectorV2):
 class Logarithm(_OfElements):
     """The natural logarithm of some elements of a vector, of those below LOWEST its own.
 
-    For distances: what is 5 cm nearer matters at 20 cm and not at 5 m, but a filter divides both alike.
+    For distances: 5 cm matter at 20 cm and not at 5 m, but a filter divides both alike.
     """
 
     LOWEST = 0.05
@@ -397,7 +397,7 @@ def _tensor(rows: list[Any], module: Any, device: Any) -> Any:
 
 
 def _evaluate(module: Any) -> Any:
-    """Put a network into evaluation mode, where it is in training mode."""
+    """Put a network into evaluation mode if it is in training mode."""
     return type(module).eval(module) if module.training else module
 
 

@@ -1,6 +1,6 @@
 """Find a distribution's kind, and the rule by which its deterministic action comes out of its parameters.
 
-Where it is none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
+If it follows none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
 action twice.
 """
 

@@ -17,7 +17,7 @@ def frozen_filter(running: Any) -> ObservationFilter:
     mean, std = np.asarray(stats.mean, np.float64), np.asarray(stats.std, np.float32)
     if not (np.isfinite(mean).all() and np.isfinite(std).all()):
         raise CheckpointError("the observation filter's mean or standard deviation is not finite: training diverged")
-    clip = float(running.clip) if running.clip else None  # RLlib tests for truth: 0 means no clipping, too
+    clip = float(running.clip) if running.clip else None  # RLlib tests for truth: 0 also means no clipping
     return ObservationFilter(int(stats.n), mean, std, clip, bool(running.demean), bool(running.destd))
 
 

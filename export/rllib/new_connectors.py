@@ -1,7 +1,7 @@
 """Read off RLlib's new-stack connector pipelines what they do to an observation and to an action.
 
 A piece that is not known is refused by its class name, because leaving it out would change the policy. The pieces are
-known by name and by coming from RLlib itself. A piece of the user's own is taken where it offers `torch_forward`, a
+known by name and by coming from RLlib itself. A piece of the user's own is used if it offers `torch_forward`, a
 function of torch tensors `[batch, ...]` that does the same as the piece.
 """
 
@@ -48,7 +48,7 @@ PLUMBING = frozenset({
     "ListifyDataForVectorEnv",
 })  # fmt: skip
 BATCHES_OBSERVATION = frozenset({"AddObservationsFromEpisodesToBatch", "FrameStacking"})
-"""Pieces that put the observation into the batch: what a later one changes in the episode comes too late."""
+"""Pieces that put the observation into the batch: later changes to the episode come too late."""
 BATCHED_CONNECTORS = "rlservo.export.rllib.batched_connectors"
 """Pieces that do what RLlib's of the same names do; those for observations also batch them."""
 

@@ -131,7 +131,7 @@ def _branches(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def _imports(tree: ast.AST) -> Iterator[tuple[str, Registration]]:
-    """Yield each name that a `from module import name` gives a file, and where it comes from."""
+    """Yield each name that a `from module import name` gives a file, and its origin."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
             for alias in node.names:

@@ -48,7 +48,7 @@ from rlservo.export.rllib.older_policies import MIXTURES, update_policy_state
 from rlservo.export.rllib.supported_spaces import check_spaces
 from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
 
-AGENT = "agent0"  # what RLlib calls the one agent of an environment
+AGENT = "agent0"  # RLlib's name for the one agent of an environment
 
 
 class OldStackNetwork(nn.Module):
@@ -74,7 +74,7 @@ def _distribution(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Tensor, A
     """Return (distribution parameters or Q-values, distribution class, state), as `_compute_action_helper` does it."""
     batch = SampleBatch({SampleBatch.OBS: obs})
     batch.set_get_interceptor(partial(convert_to_torch_tensor, device=policy.device))
-    batch.set_training(True)  # RLlib does so for inference, too
+    batch.set_training(True)  # RLlib also does so for inference
     lengths = torch.ones_like(state[0][:, 0], dtype=torch.long) if state else None
     how: dict[str, Any] = {"explore": False, "timestep": 0, "is_training": False}
     how.update({"state_batches": state, "seq_lens": lengths})

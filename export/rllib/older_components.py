@@ -47,7 +47,7 @@ def restore_older(folder: Path) -> Any:
 
 
 def lists_connectors(folder: Path) -> bool:
-    """Return whether a pipeline's folder says of which connectors it consists: up to Ray 2.38 it holds the spaces."""
+    """Return whether a pipeline's folder lists its connectors: up to Ray 2.38 it holds the spaces."""
     if not is_older(folder):
         return True
     arguments, settings = _arguments(folder)

@@ -37,14 +37,14 @@ NEEDED = (
     "ray.rllib.core.models.torch.heads",
     "ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module",
 )
-"""Imported while packages are deferred: what a checkpoint of PPO's default module names, or its pipelines."""
+"""Imported while packages are deferred: names in checkpoints of PPO's default module and its pipelines."""
 _TORCH_LIBRARY = "lib/libtorch_python.so"
 
 
 def prepare() -> None:
     """Let this process import less from now on; for a program of ours, as it changes how Ray's packages load.
 
-    torch's shared libraries are mapped beside whatever is imported next, which takes none of Python's lock: a quarter
+    torch's shared libraries are mapped while other modules are imported, which takes none of Python's lock: a quarter
     of a second of torch's import.
     """
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
@@ -55,7 +55,7 @@ def prepare() -> None:
 
 
 def _load_torch_library() -> None:
-    """Map torch's libraries. Where they are elsewhere or cannot be loaded, torch's own import reports it."""
+    """Map torch's libraries. If they are elsewhere or cannot be loaded, torch's own import reports it."""
     spec = find_spec("torch")
     for folder in (spec and spec.submodule_search_locations) or ():
         with contextlib.suppress(OSError):

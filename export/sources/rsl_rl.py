@@ -88,7 +88,7 @@ def _agent_file(model: Path) -> Path | None:
 
 
 def load_weights(file: Path) -> dict[str, Any]:
-    """Return what `torch.save` wrote, without running code. Raises CheckpointError where that cannot be read."""
+    """Return what `torch.save` wrote, without running code. Raises CheckpointError if it cannot be read."""
     import torch
 
     try:
@@ -223,7 +223,7 @@ def _traced(count: int) -> Any:
 
 
 class _Reference:
-    """rsl_rl's inference policy; it keeps its memory itself, which is set to where the gate's rows are."""
+    """rsl_rl's inference policy; it keeps its memory itself, which is set to that of the gate's rows."""
 
     def __init__(self, actor: Any) -> None:
         self._actor = actor

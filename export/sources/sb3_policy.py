@@ -43,7 +43,7 @@ MASKED = torch.finfo(torch.float32).min
 
 @dataclass(frozen=True)
 class Layout:
-    """How an environment's observation becomes the model's."""
+    """Steps from an environment's observation to the model's."""
 
     frame: Any
     """The space of what the environment gives: one frame, images as they are there."""
@@ -75,9 +75,7 @@ def restore_policy(
         else:
             observation_space = Dict({OBSERVATIONS: layout.frame, ACTION_MASK: mask})
             steps = tuple(replace(step, leaf=f"obs.{OBSERVATIONS}") for step in steps)
-        notify(
-            f"the policy takes action masks: an observation has the key '{ACTION_MASK}', 1 where a choice is allowed"
-        )
+        notify(f"the policy takes action masks: an observation has the key '{ACTION_MASK}', 1 if a choice is allowed")
     state: tuple[StateLeaf, ...] = ()
     if rule.recurrent:
         layers, _, width = policy.lstm_hidden_state_shape
@@ -98,7 +96,7 @@ def restore_policy(
 
 @dataclass(frozen=True)
 class Rule:
-    """How a policy's action comes about, and which of its numbers the graph gives beside it."""
+    """Steps from network to action, and the graph's further outputs."""
 
     mode: Mode
     transform: Transform
@@ -122,7 +120,7 @@ class Rule:
         mode: Mode = "given"
         distribution: DistributionKind | None = None
         scored_by = ""
-        # MaskablePPO's policy is no ActorCriticPolicy, but has the same parts.
+        # MaskablePPO's policy is not an ActorCriticPolicy, but has the same parts.
         if hasattr(policy, "action_net") and hasattr(policy, "action_dist"):
             scored_by = "action_net"
             if discrete:
@@ -197,7 +195,7 @@ class Network(nn.Module):
             mask, obs = _unmask(obs, policy.observation_space)
         if rule.recurrent:
             hidden = tuple(leaf.transpose(0, 1).contiguous() for leaf in state[0])
-            starts = torch.zeros(hidden[0].shape[1])  # the state is an episode's first one where one starts
+            starts = torch.zeros(hidden[0].shape[1])  # the initial state at an episode's start
             distribution, after = policy.get_distribution(obs, hidden, starts)
             next_state = [leaf.transpose(0, 1) for leaf in after]
         elif rule.masked:
@@ -292,7 +290,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     """Return how one frame of the environment becomes the model's observation.
 
     VecNormalize's own space says whether it comes before the stack, and of images whether their channels are last.
-    Raises CheckpointError where the statistics or the number of frames do not fit the model.
+    Raises CheckpointError if the statistics or the number of frames do not fit the model.
     """
     models = _leaves(model_space)
     statistics = _leaves(vec.observation_space) if vec is not None else {}

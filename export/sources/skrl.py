@@ -150,7 +150,7 @@ def _load(file: Path) -> dict[str, Any]:
 
 
 def _spaces(file: Path, config: Mapping[str, Any], weights: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """Return the spaces of observation, state (None) and action, of which the weights say the sizes."""
+    """Return the spaces of observation, state (None) and action, with the weights' sizes."""
     models = config.get("models") or {}
     of_policy = models.get("policy") or {}
     kind = str(of_policy.get("class", ""))

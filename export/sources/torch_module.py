@@ -52,7 +52,7 @@ class ModuleFiles:
 
 @dataclass(frozen=True)
 class ModuleSpec:
-    """What the user says of a module (`rlservo.export_policy`)."""
+    """A user's description of a module (`rlservo.export_policy`)."""
 
     observation_space: Any
     action_space: Any

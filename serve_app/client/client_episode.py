@@ -15,7 +15,7 @@ class ClientEpisode:
     """One episode after another, and what of it a request carries.
 
     The recurrent state is here and travels with every request, or with `server_state` it stays with the server: in a
-    session of this client, or on a stream with the connection. The server needs the last action where it limits the
+    session of this client, or on a stream with the connection. The server needs the last action if it limits the
     step from it; it is sent along when the server's may not be the one that the robot was commanded.
     """
 

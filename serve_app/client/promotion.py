@@ -165,7 +165,7 @@ class Promotion:
             return Outcome(STOPPED, f"the canary could not be started: {error.message}")
         self._ends_at = self._clock() + terms.seconds
         self._say(
-            f"watches version {version} of '{name}' beside {self._production} for {_duration(terms.seconds)}, on "
+            f"watches version {version} of '{name}' against {self._production} for {_duration(terms.seconds)}, on "
             f"{', '.join(self._counts.seen)}; the log is {self._log.path}"
         )
         return None
@@ -193,7 +193,7 @@ class Promotion:
     # Watch.
 
     def _watch(self) -> Outcome:
-        """Return the outcome, when there is one. What may pass by itself has a minute for that."""
+        """Return the outcome, when there is one. Temporary faults have a minute to pass."""
         fine_at = self._clock()
         while True:
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
@@ -272,7 +272,7 @@ class Promotion:
             self._sleep(min(1.0, self._every_s))
 
     def _attempt(self, outcome: Outcome, decided_at: int | None) -> Outcome:
-        """Carry out once; what is done already is not done again."""
+        """Carry out once; finished steps are not repeated."""
         name, version, served = self._terms.policy, self._terms.version, self._served()
         if outcome.outcome == PROMOTED and served is not None and served.production != version:
             changed = self._changed(served)

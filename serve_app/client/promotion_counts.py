@@ -1,6 +1,6 @@
 """Counts of a promotion: by how much the servers' metrics of a policy have grown since it began.
 
-A process counts from its own start. What is summed are its increments from one look to the next; one that disappears
+A process counts from its own start. Its increments between two checks are summed; one that disappears
 keeps what it had, and one that is new counts from its first look. Counters never fall: metrics that do are not trusted.
 """
 

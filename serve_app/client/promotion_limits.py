@@ -56,7 +56,7 @@ class Figure:
     against: float
     cases: float
     allowed: float  # share of the cases
-    lacks: str = ""  # what is missing to decide by it
+    lacks: str = ""  # missing cases for a decision
     surely: float = 0.0  # share that is surely too large, if that is more than `allowed`
 
     @property

@@ -57,7 +57,7 @@ class PromotionLog:
                     path.unlink(missing_ok=True)
 
     def write(self, event: str, **fields: Any) -> None:
-        """Append an entry, and have the disk keep it: what follows may not be undone. Raises UsageError."""
+        """Append an entry and sync it to disk: the next step may not be undone. Raises UsageError."""
         now = datetime.now(timezone.utc)
         entry = {"time": now.isoformat(timespec="milliseconds"), "event": event, **fields}
         content = b"\n" * self._is_torn + json.dumps(entry).encode() + b"\n"

@@ -26,7 +26,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Target:
-    """Where versions go."""
+    """Destination of versions."""
 
     policy: str
     repository: str
@@ -54,7 +54,7 @@ class Release:
     def publish(self, save: Callable[[Path], None]) -> KnownVersion:
         """Save a checkpoint under the next version's number, prove it and publish it.
 
-        Raises ParityError and others where the gate refuses it; then nothing is published.
+        Raises ParityError and others if the gate refuses it; then nothing is published.
         """
         name, place = self._target.policy, self._target.repository
         for _ in range(ATTEMPTS):

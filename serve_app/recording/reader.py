@@ -57,7 +57,7 @@ class FileFacts:
     damage: str | None = None
     """Damage beyond a missing end."""
     position: int = 0
-    """[bytes] How far it was read: a reader goes on from here when its writer has added to it."""
+    """[bytes] Position up to which it was read: a reader continues here when the file has grown."""
     messages: int = 0
     dropped: int = 0
     clock_jumps: int = 0

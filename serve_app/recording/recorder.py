@@ -60,7 +60,7 @@ class Recorder(Closeable):
         max_folder_bytes: int = 10 * 1024 * MIB,
         wait: bool = False,
     ) -> None:
-        """Record to the new file `path` where that ends in .mcap, else into the folder `path`.
+        """Record to the new file `path` if that ends in .mcap, else into the folder `path`.
 
         A folder's file is ended at `max_file_bytes` or after `max_file_s`; of a folder beyond `max_folder_bytes` the
         oldest recordings that are not being written are deleted. With `wait` a full buffer blocks the caller instead of
@@ -130,7 +130,7 @@ class Recorder(Closeable):
     def close(self) -> None:
         """Write what is in the buffer and end the file."""
         atexit.unregister(self.close)
-        with self._lock:  # what comes from now on is dropped, so that there is an end
+        with self._lock:  # later records are dropped, so that it ends
             self._closing.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(WAIT_S)

@@ -38,7 +38,7 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
 
 
 def check_proven(contract: Contract, env: gym.Env[Any, Any]) -> None:
-    """Raise UsageError where the robot is a real one and the policy was never evaluated under latency."""
+    """Raise UsageError if the robot is real and the policy was never evaluated under latency."""
     if not getattr(env.unwrapped, "is_real", False):
         return
     if not any("latency" in (one.disturbance or "") for one in contract.evaluations):
