@@ -5,7 +5,7 @@
 `rlservo serve` and `rlservo cockpit --url` run as processes of their own, as users run them, and Chromium without a
 window looks at the page (`pip install playwright`; it draws with the graphics card it finds, or in software, and the
 name of that is printed). For every window and resolution (canvas pixels to a screen's; below 1 is viser's `?fixedDpr=`)
-it prints the frames that the page drew, those that the cockpit published (as the page says), and how much processor
+it prints the frames that the page drew, those that the cockpit published (the page shows them), and how much processor
 time each part took for a frame that was drawn; plots, numbers and layout depend on time, not on frames.
 """
 

@@ -307,7 +307,7 @@ def shown(rows: list[Row], key: str, form: str) -> str:
 
 
 def heading(loads: list[float]) -> str:
-    """Return what the published page says before its tables."""
+    """Return the published page's introduction."""
     busy = f"load average {loads[0]:.1f} before the start"
     return f"""# Serving speed
 

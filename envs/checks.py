@@ -1,6 +1,7 @@
 """Checks of actions, resets and options: each refusal is a sentence that names the element.
 
-robo-gym raises a bare InvalidActionError or InvalidStateError; these say which element was wrong and by how much.
+robo-gym raises a bare InvalidActionError or InvalidStateError; these name the wrong element and by how much it is
+wrong.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
 
     `reset(seed=...)` seeds the environment and this wrapper; the same seed and actions give the same episode, and one
     disturbance more does not change what the others draw. The drawn values are in `info["randomization"]` of `reset`.
-    With nothing asked for the wrapper changes nothing. Options given to `reset` go before those of `extreme`.
+    Without arguments the wrapper changes nothing. Options given to `reset` take precedence over those of `extreme`.
 
     Raises ValueError for a range that is empty or negative, errors that do not fit the observation, and what the
     environment cannot do.

@@ -133,7 +133,7 @@ def import_robo_gym() -> None:
 def locate_robot(args: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Return the environment's id and arguments, for a manager or a robot server that answers.
 
-    Raises UnavailableError when none does: robo-gym would try for minutes, and not say what.
+    Raises UnavailableError when none does: robo-gym would try for minutes without a message.
     """
     ur = {"ur_model": args.ur_model or "ur5"} if args.task.endswith("UR") else {}
     if args.rs_address:
@@ -242,9 +242,7 @@ def sentences(what: str) -> Iterator[None]:
         raise errors.UnavailableError(f"{what}: the robot server does not answer ({reason})") from error
     except Exception as error:  # robo-gym's own tree, AssertionError, RuntimeError, Exception
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise errors.RlservoError(
-            f"{what}: {reason}; the log of the server manager or robot server says why"
-        ) from error
+        raise errors.RlservoError(f"{what}: {reason}; see the log of the server manager or robot server") from error
 
 
 def end_simulator(env: Any) -> None:

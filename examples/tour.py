@@ -75,7 +75,7 @@ def heading(text: str) -> None:
 
 
 def look_at(env_id: str, **arguments: Any) -> None:
-    """Print what an environment says of itself, and check that it keeps to it."""
+    """Print an environment's description of itself, and check that it is true."""
     env = gym.make(env_id, **arguments)
     spec = env.spec
     assert spec is not None  # gym.make's always have one

@@ -140,7 +140,7 @@ class ChosenEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     failure here.) Of the others a share has its target out of reach, by the environment's `extreme_options`: all that
     can be done there is to wait until the time is over.
 
-    Episodes are the same again by their seed. `info["is_ordinary"]` says which are neither.
+    The same seed gives the same episode. `info["is_ordinary"]` marks those that are neither.
     """
 
     def __init__(

@@ -33,7 +33,7 @@ def bundle_name(base: str, module_id: str, agent_id: str | None) -> str:
 
 
 def check_names(name: str | None, version: str | None) -> None:
-    """Raise UsageError when a name or a version that was asked for cannot be one."""
+    """Raise UsageError when a requested name or version is not valid."""
     if name is not None and not re.fullmatch(NAME_PATTERN, name):
         raise UsageError(f"'{name}' cannot be a policy's name: expected up to 64 letters, digits, '.', '_' and '-'")
     if version is not None and not re.fullmatch(VERSION_PATTERN, version):

@@ -266,7 +266,7 @@ def _build(
 
 
 def _check_filter(files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPolicy, options: ExportOptions) -> None:
-    """Raise CheckpointError for an observation filter that training has not filled, unless it was asked for."""
+    """Raise CheckpointError for an observation filter that training has not filled, unless it was allowed."""
     steps, frozen = facts.env_steps, restored.recipe.filter
     trained = "how long training took is unknown" if steps is None else f"training took {steps:,} environment steps"
     if why := restored.untrained_filter:

@@ -93,7 +93,7 @@ class Drive:
 
     @property
     def choice(self) -> Choice:
-        """The policy that drives, as it was asked for."""
+        """The policy that drives, as requested."""
         return self._choice
 
     def start(self) -> None:
@@ -235,7 +235,7 @@ class Drive:
             command()
         except (RlservoError, ValueError) as error:
             return str(getattr(error, "message", None) or error)
-        except Exception as error:  # an environment is anyone's code, and a thread that ends says nothing
+        except Exception as error:  # an environment is anyone's code, and a thread that ends reports nothing
             logger.exception("the cockpit's drive failed")
             self._phase = "paused"
             return f"{type(error).__name__}: {error}"
@@ -292,7 +292,7 @@ class Drive:
         return self._policy.act(self._obs, **reward)
 
     def _wait_for_server(self, error: RlservoError) -> None:
-        """Say it, and ask again soon: the robot stands, and what it sees has not changed."""
+        """Report it and ask again soon: the robot holds still, so its observation has not changed."""
         self._late += isinstance(error, DeadlineError)
         self._trouble = f"waiting for the policy; the robot holds still: {error.message}"
         self._before = self._after

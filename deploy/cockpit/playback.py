@@ -103,7 +103,7 @@ class PlaybackPanel:
         self._tape = tape
         contract = tape.contract
         home = env_id or home_of(contract)
-        Stage(home, home_arguments(contract), contract).close()  # or the sentence that says what does not fit
+        Stage(home, home_arguments(contract), contract).close()  # or an error about what does not fit
         self._stage = Stage(EMPTY_FLOOR if "Mir100" in home else home, home_arguments(contract))
         self._stage.begin()
         self._period_s = 1.0 / (contract.control_rate_hz or 10.0)

@@ -86,7 +86,7 @@ class Stage:
     ) -> Any:
         """Begin an episode, with the robot at `position` if that is given, and return its first observation.
 
-        One that cannot start there starts as `start` says, and one that cannot start so as the task has it.
+        An episode that cannot start there starts as `start` says, else as the task does.
         """
         options = self.env.reset_options(start=start, keep_target=keep_target)
         own = self.env.reset_options(keep_target=keep_target)

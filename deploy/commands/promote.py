@@ -108,7 +108,7 @@ def promote(
             outcome = Promotion(connect, terms, opened, every_s=every, say=terminal.note).run()
         except UsageError:
             raise
-        except RlservoError as error:  # nothing has begun, and 1 would say that it was rolled back
+        except RlservoError as error:  # nothing has begun, and 1 would mean that it was rolled back
             raise UsageError(error.message) from None
         except (SystemExit, KeyboardInterrupt) as ended:
             terminal.note(f"stopped by a signal: the canary keeps running; the same command continues ({file})")

@@ -22,7 +22,7 @@ from rlservo.export.contract.extras import needs_extra
 if TYPE_CHECKING:
     from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable
 
-EPISODES = 100  # of each row, if the caller does not say
+EPISODES = 100  # of each row by default
 WIDTH = 140  # [characters], of the table at least: narrower its figures fall apart
 
 
@@ -194,7 +194,7 @@ def _measure(
     plot: Path | None,
     write: bool,
 ) -> DisturbanceTable:
-    """Measure a bundle under disturbances; draw and keep the table where asked for.
+    """Measure a bundle under disturbances; draw and store the table if requested.
 
     The environment is made with the `env_config` the policy was trained with, without the disturbances it was trained
     under, and with `env_arguments`. Raises UsageError for a disturbance that does not exist or cannot be had.

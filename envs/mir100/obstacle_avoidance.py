@@ -22,7 +22,7 @@ SIDE = (2.1, 3.1)  # [m], |y| of start and target
 CUBE_COLUMNS = ((-2.4, -1.5), (-0.5, 0.5), (1.5, 2.4))  # [m], x of each cube
 # robo-gym's corners are those of a body centred at base_link.
 CORNERS = tuple((sx * LENGTH / 2, sy * WIDTH / 2) for sx in (1, -1) for sy in (1, -1))  # [m], in base_link
-REDRAWS = 1000  # of the cubes, while they stand in the way of a start pose that was asked for
+REDRAWS = 1000  # of the cubes, while they are in the way of a requested start pose
 
 
 class ObstacleAvoidanceMir100Sim(Mir100Navigation):

@@ -1,7 +1,7 @@
 """Runs one robot server: makes the robot, binds a port, serves until it is stopped.
 
 `rlservo robot-server` runs it in the foreground. The server manager runs it as a process of its own
-(`python -m rlservo.envs.robot_server.server '<settings>'`), which says on standard output what port it has, and ends
+(`python -m rlservo.envs.robot_server.server '<settings>'`), which prints its port on standard output, and ends
 when its standard input does: nothing outlives the manager, whatever becomes of it.
 """
 
@@ -38,11 +38,11 @@ log = logging.getLogger("rlservo.robot_server")
 
 
 class CannotListenError(OSError):
-    """The address cannot be listened on; the message says why."""
+    """The server cannot listen on the address; the message gives the reason."""
 
 
 class PortInUseError(CannotListenError):
-    """The port asked for is taken."""
+    """The requested port is taken."""
 
 
 class RobotServer:
@@ -77,7 +77,7 @@ def make_robot(settings: Settings) -> Robot:
 def bind(server: grpc.Server, host: str, port: int) -> int:
     """Bind a gRPC server and return the port it has.
 
-    Raises PortInUseError when the port is taken, CannotListenError for everything else; both say what and why.
+    Raises PortInUseError when the port is taken, CannotListenError for everything else; both name the cause.
     """
     address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     _probe(host, port, address)  # gRPC names no reason, and writes several lines to standard error

@@ -81,7 +81,7 @@ class URArmEnv(RenderedEnv):
         lower_bound_port: int | None = None,
         upper_bound_port: int | None = None,
     ) -> None:
-        """The tasks' data sheets say what each argument means; None takes the task's own value."""
+        """The arguments are described in the tasks' docstrings; None takes the task's own value."""
         del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
         fixed = np.array((fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3))
         scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor

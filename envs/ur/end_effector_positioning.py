@@ -267,7 +267,7 @@ class EndEffectorPositioningURSim(URArmEnv):
 
 
 class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
-    """The same task on a real arm: `robot` is 'rtde://192.168.0.2', say.
+    """The same task on a real arm: `robot` is for example 'rtde://192.168.0.2'.
 
     Observations, actions, rewards and endings are the simulated environment's, computed from the measured joints; a
     robot that stops ends the episode with what stopped it as `final_status` (protective_stop, emergency_stop,

@@ -20,7 +20,7 @@ def obey(server: ControllerServer, line: str) -> str:
     word, _, rest = line.strip().partition(" ")
     controller, link = server.controller, server.link
     plain: dict[str, Callable[[], object]] = {
-        "protective": lambda: controller.stop_protectively("asked for at the console"),
+        "protective": lambda: controller.stop_protectively("requested at the console"),
         "emergency": controller.stop_in_emergency,
         "unlock": lambda: "" if controller.unlock_protective_stop() else "not before 5 s have passed",
         "release": controller.recover_from_emergency_stop,

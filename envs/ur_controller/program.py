@@ -124,7 +124,7 @@ class _ControlScript:
         self._write_doubles(self._arm.positions_before(self._int(1)))
 
     def protective_stop(self) -> None:
-        self._arm.stop_protectively("asked for by the program")
+        self._arm.stop_protectively("requested by the program")
 
     def set_watchdog(self) -> None:
         self._arm.set_watchdog(self._offset, self._double(0))

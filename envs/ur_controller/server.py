@@ -36,7 +36,7 @@ log = logging.getLogger("rlservo.ur_controller")
 
 
 class CannotListenError(OSError):
-    """A port of the controller cannot be listened on; the message says which and why."""
+    """The controller cannot listen on one of its ports; the message names it and the reason."""
 
 
 @dataclass
@@ -253,6 +253,6 @@ def _listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         is_taken = error.errno == errno.EADDRINUSE
-        reason = "the port is taken; another address, 127.0.0.2 say, has ports of its own" if is_taken else str(error)
+        reason = "the port is taken; another address such as 127.0.0.2 has ports of its own" if is_taken else str(error)
         raise CannotListenError(f"cannot listen on {host}:{port}: {reason}") from error
     return listener

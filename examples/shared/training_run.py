@@ -124,7 +124,7 @@ def main_with_sentences(main: Callable[[], None], script: str) -> NoReturn:
 
 
 def default_config(algorithm: str, log_level: str = "ERROR") -> AlgorithmConfig:
-    """Return RLlib's default configuration of an algorithm, without what RLlib says about itself on the way.
+    """Return RLlib's default configuration of an algorithm, without RLlib's own messages.
 
     Registering the algorithms makes an environment that breaks its own space (DreamerV3's, ray 2.60), and each
     configuration announces that the default API stack is the default.
@@ -213,7 +213,7 @@ def _join(address: str, quiet: Mapping[str, Any]) -> None:
         if colon and "/" not in address:  # Ray itself tries for minutes
             socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
         ray.init(address, **quiet)
-    except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all say the same
+    except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all mean the same
         raise errors.UsageError(
             f"--address {address}: no Ray cluster answers there ({_first_line(error)}); start one with "
             "'ray start --head', with the same RAY_AUTH_MODE and token as here"
@@ -479,7 +479,7 @@ def _trial_name(trial: Any) -> str:
 
 
 def load_run(folder: Path) -> tuple[Run, list[str]]:
-    """Return what `run.json` of a run's folder says, and the names of the swept settings.
+    """Return the content of a run's `run.json`, and the names of the swept settings.
 
     Raises UsageError if the folder is not a run.
     """

@@ -41,7 +41,7 @@ class CheckpointFacts:
 
 
 def read_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
-    """Return what the algorithm checkpoint at `root` says of itself, with a notice for each part that is unreadable."""
+    """Return the facts in the algorithm checkpoint at `root`, with a notice for each unreadable part."""
     if (root / FACTS_FILE).is_file():
         return _from_json(root / FACTS_FILE, notify)
     if not (root / CTOR_FILE).is_file() and old_stack_root(root) is not None:

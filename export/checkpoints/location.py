@@ -52,7 +52,7 @@ class CheckpointFiles:
     alone: bool = False
     part: bool = False  # of a MultiRLModule that was saved by itself
     agent_id: str | None = None
-    """The agent that was asked for, if the module serves several."""
+    """The requested agent, if the module serves several."""
 
     @property
     def is_one_of_several(self) -> bool:

@@ -65,7 +65,7 @@ class OldStackFiles:
 def old_stack_root(given: Path) -> Path | None:
     """Return the algorithm checkpoint (or lone policy folder) of the old stack that `given` is or lies in, if any.
 
-    Raises UnsupportedError for one that is too old to say what surrounds its network.
+    Raises UnsupportedError for one that is too old to describe what surrounds its network.
     """
     inside = {POLICIES: given.parent} if given.name == POLICIES else {}
     if given.parent.name == POLICIES:
@@ -90,7 +90,7 @@ def old_stack_root(given: Path) -> Path | None:
 
 
 def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFiles:
-    """Return one policy of the checkpoint at `root`: the one asked for, the one `given` lies in, or the only one.
+    """Return one policy of the checkpoint at `root`: the requested one, the one that `given` is in, or the only one.
 
     Raises CheckpointError when there is no such policy, or several to choose from.
     """
@@ -109,7 +109,7 @@ def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFil
 
 
 def choose(root: Path, present: Sequence[str], name: str | None, singular: str, plural: str) -> str:
-    """Return the module or policy that is asked for, or the only one of those `present`. Raises CheckpointError."""
+    """Return the requested module or policy, or the only one of those `present`. Raises CheckpointError."""
     if name is not None and name not in present:
         raise CheckpointError(f"{root} has no {singular} '{name}': it holds {', '.join(present) or 'none'}")
     if name is None and len(present) > 1:

@@ -72,7 +72,7 @@ def _filesystem(uri: str) -> tuple[FileSystem, str]:
     """Return the file system that reads `uri`, and the path on it."""
     from pyarrow.fs import FileSystem, FSSpecHandler, PyFileSystem
 
-    with contextlib.suppress(Exception):  # pyarrow says no in several ways; fsspec has the last word
+    with contextlib.suppress(Exception):  # pyarrow fails in several ways; fsspec is tried next
         native, inside = FileSystem.from_uri(uri)
         return native, inside
     try:

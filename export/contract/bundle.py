@@ -205,7 +205,7 @@ def _versions(policy: Path) -> list[Path]:
 
 
 def read_contract(folder: Path, limits: BundleLimits = DEFAULT_LIMITS) -> Contract:
-    """Parse `contract.json`; say in one sentence which field is wrong."""
+    """Parse `contract.json`; an error names the wrong field in one sentence."""
     file = folder / CONTRACT_FILE
     return _parse_contract(file, b"".join(_blocks(file, *limits.of(CONTRACT_FILE))))
 

@@ -28,7 +28,7 @@ them to exit codes.
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
     │   ├── RateLimitError        rate-limited             the API key asked more often than it may
     │   ├── LateError             late                     the observation waited too long: send a newer one
-    ├── InternalError             internal                 the server's own fault: its log says more
+    ├── InternalError             internal                 the server's own fault: see its log
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
 

@@ -153,7 +153,7 @@ def prove(
 ) -> Parity:
     """Compare every format with what the framework computed and return the largest differences.
 
-    `labels` name the action's elements for the message; `reference` says for the contract what was compared with;
+    `labels` name the action's elements for the message; `reference` names the reference for the contract;
     `perturb` gives what `record_perturbed` does; it is called once, only if a difference is too large.
 
     Raises ParityError at the first output that differs, naming element, sample and difference.

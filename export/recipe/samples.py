@@ -20,7 +20,7 @@ from rlservo.export.recipe.recipe import ObservationFilter, Recipe
 from rlservo.export.recipe.runners import Inputs
 
 BATCH_SIZES = (1, 2, 257)
-UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) says nothing of the values that occur
+UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) does not describe the values that occur
 WIDE = 10.0  # standard deviations
 EXTREME = 1e3
 SEQUENCE_STEPS = {1: 200, 2: 200, 257: 3}
@@ -33,8 +33,8 @@ NEW_EPISODE = 0.02  # probability that a row's episode ends at a step, besides t
 class Batch:
     """Observations by input name in the space's dtypes, and what kind they are.
 
-    In a sequence, `restart` says which rows begin an episode; the other rows continue from the batch before. None is a
-    batch of its own.
+    In a sequence, `restart` marks the rows that begin an episode; the other rows continue from the batch before. None
+    is a batch of its own.
     """
 
     kind: str

@@ -53,7 +53,7 @@ def use_batched_connectors(
     Of the observation's elements `logarithm_of` (their indices) the logarithm is taken, of `sine_and_cosine_of` both;
     `observation_filter` is whether observations then go through a MeanStdFilter; the network sees the last `num_frames`
     of them, `every` steps apart.
-    Connectors of the configuration's own are replaced. How actions are scaled it must say before, with
+    Connectors of the configuration's own are replaced. The configuration must set the scaling of actions before, with
     `environment(normalize_actions=..., clip_actions=...)`.
     """
     # Here, since exports import this module and have no use for RLlib's env runner.

@@ -184,7 +184,7 @@ def _flatten(piece: Any, space: Any) -> Flatten:
             raise UnsupportedError(f"{name}: RLlib's own FlattenObservations cannot one-hot {leaf}, which is a grid")
     removed = private_names.get(piece, "_keys_to_remove") if isinstance(space, Dict) else None
     without = tuple(removed or ())
-    # A Box needs no more said, and the contract is shorter for it.
+    # A Box needs no further detail, which keeps the contract short.
     return Flatten() if isinstance(space, Box) else Flatten(space, without)
 
 

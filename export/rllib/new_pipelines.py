@@ -97,7 +97,7 @@ class MultiAgentPipelines(Pipelines):
 
     def begin(self, obs: Any) -> Any:
         """Return an episode that has just been reset."""
-        module = self.slot.module  # whatever the mapping says: whose slot this is has been decided
+        module = self.slot.module  # instead of the mapping: the slot's module is already known
         episode = MultiAgentEpisode(
             observation_space=self.env_to_module.input_observation_space,
             action_space=self.env_to_module.input_action_space,

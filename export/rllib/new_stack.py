@@ -113,7 +113,7 @@ class Network(nn.Module):
         actions: list[Tensor] = []
         next_state: list[Tensor] = []
         outputs: dict[str, Any] = {}
-        # A value alone does not say what to do: then the forward pass is run for the actions or the state.
+        # A value alone does not give an action: then the forward pass is run for the actions or the state.
         for name in self.names if set(self.names) - {"value"} else ("", *self.names):
             # A user's forward may change its batch, so each call gets its own.
             batch = {Columns.OBS: map_tree(lambda leaf: leaf.unsqueeze(1) if stateful else leaf, obs)}

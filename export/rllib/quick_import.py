@@ -3,7 +3,7 @@
 The `__init__` of nearly every package of Ray's imports all modules below it, so that one RLModule brings Tune, Train,
 Data, pandas and every algorithm (ray 2.60): 1.2 s of processor time for nothing. While this module imports what any
 checkpoint of the new API stack needs, such packages are made without running their `__init__`. It runs later, before
-those below it as usual, when a name of the package or another module below it is asked for: nothing is left out.
+those below it as usual, when a name of the package or another module below it is used: nothing is left out.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class _Loader:
 
 
 class _DeferredPackage(ModuleType):
-    """A package whose `__init__` has not run: it does when a name is asked for that no import has set."""
+    """A package whose `__init__` has not run: it runs when a name is used that no import has set."""
 
     def __getattr__(self, name: str) -> Any:
         spec: Any = self.__spec__

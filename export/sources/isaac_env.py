@@ -1,6 +1,6 @@
 """Action terms of an Isaac Lab or mjlab environment, from the `params/env.yaml` beside a policy.
 
-Scale, offset, joint names and control rate are in there; which joints a pattern means, only the robot's file says.
+Scale, offset, joint names and control rate are in there; which joints a pattern matches is only in the robot's file.
 """
 
 from __future__ import annotations

@@ -152,7 +152,7 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
 
 
 def _actor(file: Path, agent: Mapping[str, Any], part: str, state_dict: Mapping[str, Tensor]) -> Any:
-    """Return the actor with its weights; sizes are read off the weights, as the checkpoint does not say them."""
+    """Return the actor with its weights; sizes are those of the weights, as the checkpoint does not store them."""
     import torch
     from rsl_rl.models import MLPModel
     from rsl_rl.utils import resolve_class

@@ -1,6 +1,6 @@
 """Source of skrl 2: `agent_*.pt` with the runner's `params/agent.yaml`, as Isaac Lab writes them.
 
-A checkpoint holds weights alone. agent.yaml says which models they are of, and the weights say their sizes; models that
+A checkpoint holds only weights. agent.yaml names their models, and the weights give the sizes; models that
 were written in Python go through `rlservo.export_policy`.
 """
 

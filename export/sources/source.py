@@ -1,6 +1,6 @@
 """Source: a trainer's checkpoints, as the exporter reads them.
 
-A source finds a policy by the names of files, says what loading it takes, and restores it: the recipe around its
+A source finds a policy by the names of files, names what loading it needs, and restores it: the recipe around its
 network, the network to trace, and the framework's own way to act, which the parity gate compares with. How to add one:
 docs/how-to/sources.md.
 """
@@ -119,7 +119,7 @@ class Source(abc.ABC):
         """Return the files of every policy of a checkpoint."""
         return [self.locate(path, None, None)]
 
-    def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002  # others say it of one file and not of another
+    def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002  # others depend on the file
         """Return the clause that warns of code that loading runs; '' if it runs none."""
         return PICKLES
 
@@ -136,7 +136,7 @@ class Source(abc.ABC):
 
 
 def one_policy(path: Path, files: Sequence[Path], module_id: str | None, agent_id: str | None) -> SinglePolicy:
-    """Return the only policy of a checkpoint. Raises CheckpointError when another is asked for."""
+    """Return the only policy of a checkpoint. Raises CheckpointError when another is requested."""
     policy = SinglePolicy(path, tuple(files))
     if module_id not in (None, policy.module_id) or agent_id is not None:
         raise CheckpointError(f"{path} holds one policy: leave --module-id and --agent-id out")

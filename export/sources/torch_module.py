@@ -1,4 +1,4 @@
-"""Source of a torch module in memory: the user says what a checkpoint would."""
+"""Source of a torch module in memory: the user gives what a checkpoint would hold."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class TorchPolicy:
     """A source's module: the traced form and the framework's own."""
 
     recipe: Recipe
-    """Its mode says what the module's output is: the action ("given"), or scores to choose by ("argmax")."""
+    """Its mode is the kind of the module's output: the action ("given"), or scores to choose by ("argmax")."""
     module: nn.Module
     """It holds all weights."""
     act: Callable[[Any, Tree, list[Tensor]], tuple[Tree, list[Tensor]]]

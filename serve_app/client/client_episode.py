@@ -61,7 +61,7 @@ class ClientEpisode:
         self._is_lost = self._steps > 0
 
     def request_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any]:
-        """Return what the next request says of the episode.
+        """Return the next request's fields on the episode.
 
         Until its reply came, the server may have acted with an action that no robot has seen.
 

@@ -27,7 +27,7 @@ Numbers = dict[str, float]  # by "name/label/..."
 
 
 class UntrustedError(Exception):
-    """The metrics contradict themselves or what they said before."""
+    """The metrics contradict themselves or an earlier reading."""
 
 
 @dataclass

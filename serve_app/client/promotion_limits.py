@@ -27,7 +27,7 @@ from rlservo.serve_app.client.promotion_counts import (
 Z = 3.0  # standard deviations of every interval, 99.7%: it is looked at often, and each look may err
 FEWEST = 3  # cases against a version before anything stops early
 TAIL = 0.01  # of the requests and actions, what a p99 leaves out
-CLIENTS_OWN = frozenset(  # failures that say nothing of the version that was asked
+CLIENTS_OWN = frozenset(  # failures that are not the version's fault
     {
         *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
         *("bad-observation", "session-conflict", "session-lost", "late", "over-capacity", "deadline-passed"),

@@ -66,7 +66,7 @@ class PromotionLog:
                 content = content[self._file.write(content) :]
                 self._is_torn = bool(content)
             os.fsync(self._file)
-        except OSError as error:  # the disk is full, say
+        except OSError as error:  # for example a full disk
             raise UsageError(f"the log {self.path} cannot be written: {error.strerror}") from None
         self._add({**entry, "seconds": now.timestamp()})
 

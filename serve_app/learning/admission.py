@@ -29,7 +29,7 @@ Reward: TypeAlias = Callable[[Any, Any, Any], float]
 
 @dataclass(frozen=True)
 class KnownVersion:
-    """A version that this run has made, by what a server's recording says of it."""
+    """A version that this run has made, as a server's recording identifies it."""
 
     version: str
     graph_sha256: str
@@ -51,7 +51,7 @@ class Admission:
     """Decides about one episode after the other."""
 
     def __init__(self, policy: str, *, max_age: int, reward: Reward | None = None) -> None:
-        """`reward` stands in for what clients say that each action brought."""
+        """`reward` replaces the rewards that clients report."""
         self._policy, self._max_age, self._reward = policy, max_age, reward
 
     def judge(self, episode: Episode, versions: Sequence[KnownVersion]) -> Admitted | str | None:

@@ -159,7 +159,7 @@ class Episode:
 
     @property
     def robot(self) -> list[dict[str, Any]]:
-        """Return for each row what a real robot's step said of it (`state`, `changes`, `limited`); empty elsewhere."""
+        """Return each row's report of a real robot's step (`state`, `changes`, `limited`); empty elsewhere."""
         return [{} if one is None else one.get("robot", {}) for one in self._outcomes]
 
     @property

@@ -182,7 +182,7 @@ class WithRecording(ActingPolicy):
         return self._format
 
     def _add_details(self, record: DecisionRecord) -> None:
-        """Add what the policy says of its last action."""
+        """Add the policy's details of its last action."""
         failure = getattr(self._policy, "failure", None)  # of a policy with a fallback
         if failure is not None and record.error is None:
             record.action, record.commanded, record.error = None, record.action, failure.code

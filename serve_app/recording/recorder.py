@@ -1,7 +1,7 @@
 """Recorder: a bounded buffer on the hot path, and a thread that writes what is in it to MCAP files.
 
 Recording never gets in the way of acting: `record` takes a microsecond and raises nothing, what does not fit into the
-buffer is dropped and counted (and the file says where), and when a file cannot be written recording ends with one
+buffer is dropped and counted (and the file marks where), and when a file cannot be written recording ends with one
 line in the log.
 """
 

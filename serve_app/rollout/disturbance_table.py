@@ -41,7 +41,7 @@ Z_95 = 1.96
 
 @dataclass(frozen=True)
 class DisturbedRow:
-    """Result under one disturbance. Success is None if the environment does not say."""
+    """Result under one disturbance. Success is None if the environment does not report it."""
 
     disturbance: str
     episodes: int

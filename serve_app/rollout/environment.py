@@ -150,7 +150,7 @@ def _name_difference(expected: SpaceSpec, elements: Any) -> str | None:
 
 
 def _description(env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what the environment class says of itself, if it does: element names and the control rate."""
+    """Return the environment class's description, if it has one: element names and the control rate."""
     describe = getattr(type(env.unwrapped), "describe", None)
     if describe is None:
         return {}

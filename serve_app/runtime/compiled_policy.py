@@ -44,7 +44,7 @@ class CompiledPolicy(Policy):
     """
 
     def __init__(self, path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS) -> None:
-        """Raises BundleError where the folder has no library, and BundleTamperedError for one other than proven."""
+        """Raises BundleError if the folder has no library, BundleTamperedError if it is not the one that was proven."""
         folder = Path(path)
         about = _read_about(folder)
         contract = acting_contract(read_contract(folder))
@@ -97,7 +97,7 @@ class CompiledLibrary:
     """The functions of a shared library, in the form of onnxruntime's session: `run`."""
 
     def __init__(self, file: Path, prefix: str, contract: Contract) -> None:
-        """Raises BundleError where the library cannot be loaded, or is none of a compiled policy."""
+        """Raises BundleError if the library cannot be loaded, or is not that of a compiled policy."""
         try:
             library = ctypes.CDLL(str(file.resolve()))
             self._act, self._reset, self._element = (
@@ -152,7 +152,7 @@ class CompiledLibrary:
         return codes, outputs
 
     def _memory(self) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
-        """Return this thread's structs: the array of each tensor, and where the structs begin."""
+        """Return this thread's structs: the array of each tensor, and the structs' addresses."""
         if not hasattr(self._own, "structs"):
             places: dict[str, NDArray[Any]] = {}
             raws = []
