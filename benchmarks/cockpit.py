@@ -1,12 +1,12 @@
-"""Cockpit speed: frames per second of one robot in a real browser, with the policy server beside it.
+"""Cockpit speed: frames per second of one robot in a real browser, with the policy server on the same machine.
 
     python benchmarks/cockpit.py policies [--policy ur5] [--seconds 8] [--window 1280x720 800x600] [--resolution 1 0.5]
 
 `rlservo serve` and `rlservo cockpit --url` run as processes of their own, as users run them, and Chromium without a
 window looks at the page (`pip install playwright`; it draws with the graphics card it finds, or in software, and the
 name of that is printed). For every window and resolution (canvas pixels to a screen's; below 1 is viser's `?fixedDpr=`)
-it prints the frames that the page drew, those that the cockpit published (as the page says), and how much processor
-time each part took for a frame that was drawn: what of it is plots, numbers and layout goes by time, not by frame.
+it prints the frames that the page drew, those that the cockpit published (the page shows them), and how much processor
+time each part took for a frame that was drawn; plots, numbers and layout depend on time, not on frames.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from rich.table import Table
 
 SETTLE_S = 4.0  # shaders are compiled, viser has settled on a resolution
 PATIENCE_S = 120.0
-# Draws are counted where WebGL is called: a frame in which nothing was drawn is none.
+# Draws are counted at WebGL's calls: a frame without a draw does not count.
 COUNTER = """
 let drawn = null; window.frames_drawn = 0;
 for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
@@ -51,7 +51,7 @@ requestAnimationFrame(count);
 RENDERER = """() => {
   const gl = document.createElement("canvas").getContext("webgl2");
   const known = gl?.getExtension("WEBGL_debug_renderer_info");
-  return known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "not told";
+  return known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "unknown";
 }"""
 
 

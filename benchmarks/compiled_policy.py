@@ -1,4 +1,4 @@
-"""Measure a step of a compiled policy beside onnxruntime and TorchScript in this process.
+"""Measure a step of a compiled policy against onnxruntime and TorchScript in this process.
 
     python benchmarks/compiled_policy.py [--rounds 7] [--cc gcc]
 

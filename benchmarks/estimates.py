@@ -96,7 +96,7 @@ def trajectories(
     recorded: Probability | None,
     candidate: Candidate,
 ) -> list[Trajectory]:
-    """Return what an estimate is made of; `recorded` is None where the log-probabilities are not known."""
+    """Return the parts of an estimate; `recorded` is None if the log-probabilities are not known."""
     found = []
     one_hot = np.eye(2, dtype=np.float32)
     for index, length in enumerate(lengths):

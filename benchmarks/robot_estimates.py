@@ -42,7 +42,7 @@ DETERMINISTIC = {  # the spread is e^-20 of what it was
 
 @dataclass
 class Recorded:
-    """One episode: what happened, and what the variants make of it."""
+    """One episode, and the variants' probabilities of its actions."""
 
     rewards: list[float] = field(default_factory=list)
     weights: list[NDArray[np.float64]] = field(default_factory=list)
@@ -119,7 +119,7 @@ def main() -> None:
             candidate.truth = float(np.mean([sum(one.rewards) for one in driven]))
             print(f"{candidate.name}: true return {candidate.truth:.3f}", flush=True)
         recorded = run_episodes(policy, (0.0, 0.0), arguments.episodes * arguments.repetitions, 0)
-        if not arguments.fitted:  # more episodes than above, of which one recording is a hundredth: the better truth
+        if not arguments.fitted:  # more episodes than above (one recording is a hundredth of them): the better truth
             candidates[0].truth = float(np.mean([sum(one.rewards) for one in recorded]))
         for repetition in range(arguments.repetitions):
             episodes = recorded[repetition * arguments.episodes :][: arguments.episodes]

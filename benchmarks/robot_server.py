@@ -135,7 +135,7 @@ def robo_gym_speed(python: Path, seconds: float) -> dict[str, Any]:
     finally:
         manager.close()
     if done.returncode != 0:
-        raise SystemExit(f"--robo-gym {python}: its environments could not be measured; the reason stands above")
+        raise SystemExit(f"--robo-gym {python}: its environments could not be measured; see above")
     results: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return results
 

@@ -1,8 +1,8 @@
-"""Serving speed beside other servers: start, memory, latency, throughput, robots at a fixed rate, WebSocket.
+"""Serving speed compared with other servers: start, memory, latency, throughput, robots at a fixed rate, WebSocket.
 
-    python benchmarks/serving.py --install     # once: the peers' environments; what is not installed is left out
-    python benchmarks/serving.py               # six minutes; run again, it goes on where it stopped
-    python benchmarks/serving.py --publish     # the same, and writes benchmarks/results/serving.md
+    python benchmarks/serving.py --install     # once: the peers' environments; servers that are not installed are left
+    out python benchmarks/serving.py               # six minutes; a second run continues python benchmarks/serving.py
+    --publish     # the same, and writes benchmarks/results/serving.md
 
 One server runs at a time. Rounds alternate between all servers, and what is compared with bare uvicorn is a ratio
 within one round: a machine's speed drifts by more than servers differ.
@@ -47,7 +47,7 @@ END_S = 20.0  # [s] for a server to end
 QUIET = 0.5  # load average above which the figures are of a busy machine
 
 Row = dict[str, Any]
-# Goals of ours beside bare uvicorn: at most, or at least, this ratio.
+# Our goals compared with bare uvicorn: at most, or at least, this ratio.
 GOALS = {
     "one.p50": ("1 connection, p50", 1.2),
     "sixteen.per_second": ("16 connections, requests/s", 0.65),
@@ -99,7 +99,7 @@ def started(peer: Peer) -> Iterator[subprocess.Popen[bytes]]:
         except Exception as error:
             output.seek(0, os.SEEK_END)
             output.seek(max(0, output.tell() - 400))
-            raise RuntimeError(f"{error}; its last words: {output.read().decode(errors='replace')}") from error
+            raise RuntimeError(f"{error}; its last output: {output.read().decode(errors='replace')}") from error
         finally:
             end(server)
 
@@ -281,7 +281,7 @@ def report(rows: list[Row]) -> str:
         return "\n".join(lines) + "\n"
     lines += [
         "",
-        f"`{OURS}` beside {BARE}, medians of the ratios within a round:",
+        f"`{OURS}` against {BARE}, medians of the ratios within a round:",
         "",
         "| | ratio | goal |",
         "|---|---|---|",
@@ -307,7 +307,7 @@ def shown(rows: list[Row], key: str, form: str) -> str:
 
 
 def heading(loads: list[float]) -> str:
-    """Return what the published page says before its tables."""
+    """Return the published page's introduction."""
     busy = f"load average {loads[0]:.1f} before the start"
     return f"""# Serving speed
 
@@ -330,13 +330,13 @@ def processor() -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--install", action="store_true", help="make the peers' environments, and end")
+    parser.add_argument("--install", action="store_true", help="make the peers' environments and exit")
     parser.add_argument(
         "--publish", action="store_true", help=f"write {PUBLISHED.relative_to(ROOT)} when all is measured"
     )
     parser.add_argument("--quick", action="store_true", help="one short round, to see that it works")
     parser.add_argument("--again", action="store_true", help="forget what an earlier run has measured")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="stop after this time; the next run goes on")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="stop after this time; the next run continues")
     parser.add_argument("--only", nargs="+", choices=list(MAKERS), default=list(MAKERS), help="these servers")
     parser.add_argument("--out", type=Path, default=ROOT / "bench", help="folder of the policy and the raw figures")
     given = parser.parse_args()
@@ -360,7 +360,7 @@ def main() -> None:
     tables = report(read(file))
     print(tables)
     if not is_complete:
-        print("the time is over: run it again to go on", file=sys.stderr)
+        print("time is up: run it again to continue", file=sys.stderr)
         sys.exit(2)
     if given.publish:
         PUBLISHED.parent.mkdir(exist_ok=True)

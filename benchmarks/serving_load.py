@@ -98,7 +98,7 @@ class Robot(asyncio.Protocol):
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport) or hasattr(transport, "write")
-        self._transport: asyncio.Transport = transport  # type: ignore[assignment]  # uvloop's is no subclass
+        self._transport: asyncio.Transport = transport  # type: ignore[assignment]  # uvloop's is not a subclass
         transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._loop = asyncio.get_running_loop()
         if self._period_s:
@@ -219,7 +219,7 @@ def measure(plan: Plan) -> Result:
     """Carry out one measurement."""
     begin = time.perf_counter() + WARM_UP_S
     times, content = Times(begin, begin + plan.seconds), base64.b64decode(plan.request)
-    with contextlib.suppress(OSError):  # what came until then counts, and that it failed
+    with contextlib.suppress(OSError):  # replies until then count, and the failure
         if plan.stream:
             stream(plan, content, times)
         elif plan.connections == 1 and not plan.rate_hz:

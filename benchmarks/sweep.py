@@ -62,7 +62,7 @@ class Trial:
         return (self.folder / name / "curve.csv").read_text(encoding="utf-8").splitlines()[-1]
 
     def how_far(self) -> str:
-        """Return what its training said last."""
+        """Return the last line of its training's output."""
         log = self.folder / "log"
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines() if log.exists() else []
         last = next((line.partition("  return")[0] for line in reversed(lines) if line.startswith("steps ")), "begins")

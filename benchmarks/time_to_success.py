@@ -1,4 +1,4 @@
-"""Measure how long training takes until 95 of the last 100 episodes succeed, beside Stable-Baselines3's PPO.
+"""Training time until 95 of the last 100 episodes succeed, compared with Stable-Baselines3's PPO.
 
     python benchmarks/time_to_success.py                          # both, UR5, ten to twenty minutes on two cores
     python benchmarks/time_to_success.py --seeds 0 1 2 --only rllib
@@ -54,7 +54,7 @@ class Run:
 
     @property
     def reached(self) -> tuple[int, float] | None:
-        """Steps and seconds until enough of the last episodes succeeded; None where they never did."""
+        """Steps and seconds until enough of the last episodes succeeded; None if they never did."""
         return next(((steps, seconds) for steps, seconds, success in self.curve if success >= SUCCESS), None)
 
 

@@ -1,4 +1,4 @@
-"""Several UR5s in one process: what steps them fastest, environment steps per second by way and number of robots.
+"""Several UR5s in one process: environment steps per second by method and number of robots.
 
     python benchmarks/vectorisation.py            # 1, 4 and 16 robots; about a minute and a half
     python benchmarks/vectorisation.py --quick    # about 30 s

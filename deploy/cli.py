@@ -35,7 +35,7 @@ from rlservo.export.contract.errors import RlservoError, UsageError
 
 app = typer.Typer(
     name="rlservo",
-    help="From a Ray RLlib checkpoint to a robot in the loop: export it, prove it, serve it, drive with it.",
+    help="Policies from Ray RLlib and other trainers to robots: export, prove, serve, drive.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help: rich's tables and its Markdown parser would double the time of `--help`

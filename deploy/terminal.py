@@ -69,7 +69,7 @@ def status(text: str) -> Iterator[Callable[[str], None]]:
         from rich.text import Text
 
         spinner = Spinner("dots", Text(text))
-        # What is printed meanwhile comes above the line, unless it goes somewhere else.
+        # Text printed meanwhile appears above the line, unless it goes to another stream.
         with Live(spinner, console=errors(), transient=True, redirect_stdout=sys.stdout.isatty()):
             yield lambda text: spinner.update(text=Text(text))
         return
@@ -106,7 +106,7 @@ def ctrl_c_sets(stop: threading.Event) -> Iterator[None]:
     """Let Ctrl-C, SIGTERM and a closed terminal set `stop`; a second one interrupts. Only in the main thread.
 
     An interrupt comes wherever the program happens to be: in a library it may be swallowed, or leave a lock held.
-    Nobody inside may wait for `stop` in this thread: to set it takes a lock that waiting holds for moments.
+    Code inside must not wait for `stop` in this thread: setting it needs a lock that waiting briefly holds.
     """
     was_asked = False  # not `stop.is_set`: two signals may come together, and this be interrupted by itself
 

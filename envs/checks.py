@@ -1,6 +1,7 @@
 """Checks of actions, resets and options: each refusal is a sentence that names the element.
 
-robo-gym raises a bare InvalidActionError or InvalidStateError; these say which element was wrong and by how much.
+robo-gym raises a bare InvalidActionError or InvalidStateError; these name the wrong element and by how much it is
+wrong.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def element(name: str, unit: str) -> ElementInfo:
 
 
 class EnvDescription(TypedDict):
-    """What `Env.describe(**constructor_arguments)` returns without building the environment.
+    """Result of `Env.describe(**constructor_arguments)`, which builds no environment.
 
     The exporter writes it into the policy's contract; any environment may offer the same classmethod.
     """

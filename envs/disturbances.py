@@ -28,7 +28,7 @@ class CarriesPayload(Protocol):
 
 @runtime_checkable
 class HasRobotModels(Protocol):
-    """An environment in which another robot of the same kind may stand."""
+    """An environment whose robot can be replaced by another of the same kind."""
 
     def set_robot_model(self, name: str) -> None:
         """Exchange the robot; `reset` is next. Raises ValueError for a model that does not exist."""
@@ -52,7 +52,7 @@ class HasBaseOffset(Protocol):
     """An environment whose robot may stand elsewhere than it believes."""
 
     def set_base_offset(self, offset: tuple[float, float]) -> None:
-        """Tell the policy places of things in the world wrong by `offset` (x, y) [m], until the next call."""
+        """Give the policy positions of objects that are wrong by `offset` (x, y) [m], until the next call."""
         ...
 
 

@@ -29,7 +29,7 @@ def has_display() -> bool:
     import glfw  # MuJoCo's own dependency
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it warns where the display does not answer or has no OpenGL
+        warnings.simplefilter("ignore")  # it warns if the display does not answer or has no OpenGL
         if not glfw.init():
             return False
         glfw.window_hint(glfw.VISIBLE, glfw.FALSE)
@@ -43,13 +43,13 @@ def has_display() -> bool:
 def offscreen_context(width: int, height: int) -> Any:
     """Return an OpenGL context for pictures of width x height pixels, with `make_current` and `free`.
 
-    MUJOCO_GL decides where it names egl or osmesa. Otherwise the display's OpenGL is used, and without a display EGL,
-    then OSMesa. MuJoCo itself reads MUJOCO_GL only when it is imported, and fails without a display where it is unset.
+    MUJOCO_GL decides if it names egl or osmesa. Otherwise the display's OpenGL is used, and without a display EGL,
+    then OSMesa. MuJoCo itself reads MUJOCO_GL only when it is imported, and fails without a display if it is unset.
     Raises CannotDrawError.
     """
     backend = os.environ.get("MUJOCO_GL", "").strip().lower()
     if not hasattr(mujoco, "GLContext"):
-        raise CannotDrawError(f"no picture can be drawn: MUJOCO_GL={backend} turns MuJoCo's pictures off")
+        raise CannotDrawError(f"no picture can be drawn: MUJOCO_GL={backend} turns MuJoCo's rendering off")
     if backend not in ("egl", "osmesa"):
         if has_display():
             return mujoco.GLContext(width, height)

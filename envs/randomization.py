@@ -1,4 +1,4 @@
-"""Domain randomisation: what a real robot adds to a simulator, drawn for each episode.
+"""Domain randomisation: latency, noise, payload and model errors, drawn for each episode.
 
 A wrapper for every Gymnasium environment: delays and losses need nothing of it, noise a vector of numbers, the rest an
 environment of this package or one with the methods in `disturbances.py`.
@@ -62,9 +62,9 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
 
     `observation_noise` and `observation_bias` are one number for all elements, one each, a mapping by element name, or
     "real" for what the environment's `sensor_errors` states of real sensors, each element in its own unit ("2*real"
-    for twice as much). Who has which figures, and from where, is in `ur/sensor_errors.py`, `mir100/sensor_errors.py`
+    for twice as much). The figures and their sources are in `ur/sensor_errors.py`, `mir100/sensor_errors.py`
     and the `draw_model_error` of the two simulations. Only UR arms carry a payload. An arm whose base stands elsewhere
-    is told the places of targets and objects wrong, a mobile robot whose localisation is off the target's.
+    gets wrong positions of targets and objects; a mobile robot whose localisation is off, of the target.
 
     Until the first delayed action takes effect the robot does nothing new: the first action of the episode is what it
     repeats. Until there is an old observation the first one is given. Of observations that arrive late or not at all,
@@ -72,8 +72,8 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     judged on what really happened.
 
     `reset(seed=...)` seeds the environment and this wrapper; the same seed and actions give the same episode, and one
-    disturbance more does not change what the others draw. What was drawn is in `info["randomization"]` of `reset`.
-    With nothing asked for the wrapper changes nothing. Options given to `reset` go before those of `extreme`.
+    disturbance more does not change what the others draw. The drawn values are in `info["randomization"]` of `reset`.
+    Without arguments the wrapper changes nothing. Options given to `reset` take precedence over those of `extreme`.
 
     Raises ValueError for a range that is empty or negative, errors that do not fit the observation, and what the
     environment cannot do.
@@ -248,12 +248,12 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         for number in reversed(range(len(self._in_flight))):
             if self._in_flight[number][0] <= self._steps:
                 self._last_seen = self._in_flight[number][1]
-                del self._in_flight[: number + 1]  # what was sent before it is of no use any more
+                del self._in_flight[: number + 1]  # those sent before it are obsolete
                 break
         return self._last_seen
 
     def _kept(self, observation: Any) -> Any:
-        """Return an observation that the environment cannot write into, where it is needed later."""
+        """Return an observation that the environment cannot overwrite, if it is needed later."""
         is_kept = self._observation_latency[1] or self._late[1] or self._dropped[1]
         return copy.deepcopy(observation) if is_kept else observation
 
@@ -323,7 +323,9 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
             raise ValueError(f"{name} is {value!r}: expected numbers, {REAL!r} or a multiple such as '2*{REAL}'")
         env = self.env.unwrapped
         if not isinstance(env, HasSensorErrors):
-            raise ValueError(f"{name} is {value!r}: {type(env).__name__} does not state its sensors' (sensor_errors)")
+            raise ValueError(
+                f"{name} is {value!r}: {type(env).__name__} does not state its sensors' errors (sensor_errors)"
+            )
         errors = env.sensor_errors()
         attribute = "noise" if name == "observation_noise" else "bias"
         return {element: scale * float(getattr(error, attribute)) for element, error in errors.items()}
@@ -392,7 +394,7 @@ def _describe(**env_config: Any) -> Any:
     return describe(**wrapped_env(RANDOMIZED, env_config)[1]) if describe else {}
 
 
-make_randomized.describe = _describe  # type: ignore[attr-defined]  # where `rlservo export` looks for names and units
+make_randomized.describe = _describe  # type: ignore[attr-defined]  # `rlservo export` looks here for names and units
 
 
 def _range(name: str, value: Range) -> Range:

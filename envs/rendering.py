@@ -26,13 +26,13 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     Positions in the methods below are in MuJoCo's world.
     """
 
-    IS_PLANAR: ClassVar[bool] = False  # whether the robot drives on the floor, and everything that can be moved as well
+    IS_PLANAR: ClassVar[bool] = False  # whether robot and movable objects stay on the floor
 
     _camera: Camera
 
     def __init__(self, render_mode: str | None, *, gui: bool) -> None:
         if gui and render_mode is None:
-            render_mode = "human"  # what robo-gym's `gui` shows
+            render_mode = "human"  # as robo-gym's `gui`
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ValueError(f"render_mode {render_mode!r} does not exist: expected one of {', '.join(RENDER_MODES)}")
         self.render_mode = render_mode
@@ -57,10 +57,10 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @abstractmethod
     def robot_position(self) -> Vector:
-        """Return where the part of the robot is that is to reach the target [m] (3,)."""
+        """Return the position of the part of the robot that must reach the target [m] (3,)."""
 
     def target_position(self) -> Vector | None:
-        """Return where the target is [m] (3,), or what is to be avoided; None for a task without either."""
+        """Return the position of the target, or of the obstacle to avoid [m] (3,); None for a task without either."""
         return None
 
     def move_target(self, position: ArrayLike) -> None:
@@ -68,7 +68,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         raise ValueError(f"{type(self).__name__} has no target to move to {np.asarray(position).tolist()}")
 
     def obstacle_positions(self) -> Vector:
-        """Return where the obstacles are that can be moved [m] (n, 3)."""
+        """Return the positions of the movable obstacles [m] (n, 3)."""
         return np.zeros((0, 3))
 
     def move_obstacle(self, index: int, position: ArrayLike) -> None:
@@ -76,7 +76,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         raise ValueError(f"{type(self).__name__} has no obstacle {index} to move to {np.asarray(position).tolist()}")
 
     def viewpoint(self) -> tuple[Vector, Vector]:
-        """Return where the camera stands and what it looks at [m] (3,) each."""
+        """Return the positions of the camera and of the point it looks at [m] (3,) each."""
         return self._camera.viewpoint()
 
     def beams(self) -> Vector:
@@ -84,7 +84,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return np.zeros((0, 2, 3))
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:  # noqa: ARG002
-        """Return options of `reset` for an episode that starts as the task has it, at random, or where the robot is.
+        """Return options of `reset` for an episode that starts at the task's pose, at random, or at the robot's pose.
 
         With `keep_target` the target stays as well. A task that cannot start so starts in its own way.
         """
@@ -98,7 +98,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
         """Put robot and target where row `row` of an episode's observations (n, size) has them: to look at, not to act.
 
-        What the observations do not tell is where a new environment has it.
+        Anything that the observations do not contain keeps a new environment's value.
         """
 
     def _refresh_window(self) -> None:
@@ -137,7 +137,7 @@ class Camera:
         return self._picture.draw(self.data, self._view)
 
     def viewpoint(self) -> tuple[Vector, Vector]:
-        """Return where the camera stands and what it looks at [m] (3,) each."""
+        """Return the positions of the camera and of the point it looks at [m] (3,) each."""
         azimuth, elevation = np.radians([self._view.azimuth, self._view.elevation])
         ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         return self._view.lookat - self._view.distance * ahead, self._view.lookat.copy()
@@ -153,7 +153,7 @@ class Camera:
                     "no window can be opened: DISPLAY and WAYLAND_DISPLAY name no display with OpenGL; "
                     "render_mode='rgb_array' needs none"
                 )
-            import mujoco.viewer  # opens a display connection when imported, so only where one is wanted
+            import mujoco.viewer  # opens a display connection when imported
 
             before = set(threading.enumerate())
             self._viewer = mujoco.viewer.launch_passive(self.model, self.data)

@@ -23,7 +23,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Shape:
-    """One geom: what it looks like and where it sits on its body."""
+    """One geom: its appearance and its pose on the body."""
 
     body: int
     kind: str  # plane, sphere, capsule, cylinder, box or mesh

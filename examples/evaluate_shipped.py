@@ -5,7 +5,7 @@
     python examples/evaluate_shipped.py mir100_sparse_fixes --checkpoint runs/mir100_sparse_fixes/checkpoint
 
 Each checkpoint is exported (which writes nothing unless the file acts as RLlib does) and acts through `Policy`, as on a
-robot. What is run is the list `evaluation` in the policy's training.yaml.
+robot. It runs the list `evaluation` in the policy's training.yaml.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ BEGIN, END = "<!-- evaluate_shipped.py begins -->", "<!-- evaluate_shipped.py en
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What one evaluation came to. Success is None where neither environment nor training.yaml says what it is."""
+    """Result of one evaluation. Success is None if neither environment nor training.yaml defines it."""
 
     start: str
     env_config: dict[str, Any]
@@ -46,7 +46,7 @@ class Evaluation:
     return_interval: tuple[float, float]  # 95%, of the mean, normal
     worst_return: float
     mean_steps: float
-    endings: dict[str, int]  # how many episodes ended in which way
+    endings: dict[str, int]  # number of episodes by ending
 
 
 def shipped_names() -> list[str]:
@@ -158,7 +158,7 @@ def main() -> None:
     if args.episodes < 2 or args.seed < 0:
         parser.error(f"--episodes is {args.episodes} and --seed {args.seed}: expected at least 2 and 0")
     if args.checkpoint is not None and (len(names) != 1 or args.write):
-        parser.error("--checkpoint goes with one NAME and without --write: cards are of what ships")
+        parser.error("--checkpoint needs one NAME and no --write: cards describe what ships")
     with tempfile.TemporaryDirectory() as bundles:
         for name in names:
             try:

@@ -4,7 +4,7 @@
 
 Recordings (`rlservo rollout --record`, `WithRecording`, clients) become RLlib's episodes: actions as the module gave
 them, before unsquash and clip; observations through the checkpoint's own connectors, filters as they stand. BC, MARWIL,
-CQL and IQL learn from whole episodes, starting at the checkpoint's weights where the algorithm has such a network. The
+CQL and IQL learn from whole episodes, starting at the checkpoint's weights if the algorithm has such a network. The
 result is a checkpoint that `rlservo export` takes. Without `--from` the network is new, and so is its observation
 filter: of the recorded observations. docs/how-to/learn.md has the whole path.
 """
@@ -57,7 +57,7 @@ ALGORITHMS = ("BC", "MARWIL", "CQL", "IQL")
 
 @dataclass(frozen=True)
 class Start:
-    """What the next version has from the last one, or what a new one begins with."""
+    """Parts that the next version takes from the last one, or a new one's initial ones."""
 
     env_to_module: Any
     module_to_env: Any
@@ -72,28 +72,28 @@ def argument_parser() -> argparse.ArgumentParser:
     parser.add_argument("recordings", nargs="+", type=Path, help="recordings (.mcap), or folders of them")
     parser.add_argument("--policy", help="name of the recorded policy; required if there are several")
     parser.add_argument("--run", choices=ALGORITHMS, default="MARWIL", help="RLlib's algorithm")
-    parser.add_argument("--from", type=Path, dest="start", metavar="CHECKPOINT", help="checkpoint to go on from")
+    parser.add_argument("--from", type=Path, dest="start", metavar="CHECKPOINT", help="checkpoint to continue from")
     parser.add_argument("--out", type=Path, required=True, help="new folder for the checkpoint")
-    parser.add_argument("--status", help="learn only from episodes with this final status, say success")
+    parser.add_argument("--status", help="learn only from episodes with this final status, such as success")
     parser.add_argument(
         "--modes", action="store_true",
-        help="where the recorded policy explored, learn its most likely actions in place of those it drew (BC)",
+        help="learn the recorded policy's most likely actions instead of those it drew (BC)",
     )  # fmt: skip
     parser.add_argument(
         "--ahead", type=int, default=0,
-        help="learn for each observation the action of so many control cycles later (BC): the robot's latency",
+        help="for each observation learn the action of this many control cycles later (BC), against latency",
     )  # fmt: skip
     parser.add_argument("--epochs", type=int, default=20, help="passes over the recordings")
     parser.add_argument("--batch-size", type=int, default=1024, help="decisions in a minibatch")
     parser.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE",
-        help="a setting of the algorithm's configuration, say lr=3e-4 or beta=0.5",
+        help="a setting of the algorithm's configuration, such as lr=3e-4 or beta=0.5",
     )  # fmt: skip
     parser.add_argument("--hidden", default="256,256", help="sizes of a new network's layers")
-    parser.add_argument("--use-lstm", action="store_true", help="a new network is recurrent")
+    parser.add_argument("--use-lstm", action="store_true", help="make the new network recurrent")
     parser.add_argument(
         "--observation-filter", choices=("NoFilter", "MeanStdFilter"), default="MeanStdFilter",
-        help="of a new network",
+        help="seed of a new network",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     return parser
@@ -115,10 +115,10 @@ def start_from(checkpoint: Path, recorded: Recorded) -> Start:
     ours = env_to_module.input_observation_space
     alike = ours == seen or (isinstance(ours, Box) and isinstance(seen, Box) and ours.shape == seen.shape)
     if not alike:
-        raise errors.UsageError(f"--from {checkpoint}: it observes {ours}, and recorded is {seen}")
+        raise errors.UsageError(f"--from {checkpoint}: it observes {ours}, the recordings have {seen}")
     if module_to_env.input_action_space != done:
         raise errors.UsageError(
-            f"--from {checkpoint}: its actions are {module_to_env.input_action_space}, recorded are {done}"
+            f"--from {checkpoint}: its actions are {module_to_env.input_action_space}, the recordings have {done}"
         )
     return Start(env_to_module, module_to_env, RLModule.from_checkpoint(str(files.module)), files.module)
 
@@ -147,7 +147,7 @@ def start_anew(config: AlgorithmConfig, recorded: Recorded, with_filter: bool) -
 def module_spec(config: AlgorithmConfig, start: Start, longest: int) -> tuple[RLModuleSpec | None, str]:
     """Return the module that an algorithm learns, None for its own new one, and a sentence about it.
 
-    BC and MARWIL go on with any network that has a value function, CQL and IQL with SAC's. A recurrent module learns
+    BC and MARWIL continue with any network that has a value function, CQL and IQL with SAC's. A recurrent module learns
     from whole episodes: its sequences are as long as the longest.
     """
     module = start.module
@@ -164,7 +164,7 @@ def module_spec(config: AlgorithmConfig, start: Start, longest: int) -> tuple[RL
     )
     if module.is_stateful():
         settings["max_seq_len"] = longest
-    if not actor_critic:  # the learner's own class has more heads than SAC's; those begin anew
+    if not actor_critic:  # the learner's own class has more heads than SAC's; those start untrained
         default = cast(RLModuleSpec, config.get_default_rl_module_spec())
         spec.module_class, spec.catalog_class = default.module_class, default.catalog_class
     spec.model_config = settings
@@ -222,7 +222,7 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
     search_space.apply(config, changes, "--set")
     search_space.validate(config)
     if cast(Any, config).num_learners:
-        raise errors.UsageError("--set num_learners: recordings are learned from in this process, by one learner")
+        raise errors.UsageError("--set num_learners: one learner in this process reads the recordings")
     return config, start, sentence
 
 
@@ -233,7 +233,7 @@ def learn(config: AlgorithmConfig, episodes: list[SingleAgentEpisode], epochs: i
         for epoch in range(epochs):
             result = training_run.iterate(algorithm)
             if not failures.metric(result, failures.TRAINED) > 0:
-                raise errors.RlservoError("nothing was learned: the learner took no step of the recordings")
+                raise errors.RlservoError("nothing was learned: the learner took no step on the recordings")
             results = result["learners"]["default_policy"]
             losses = "  ".join(f"{name} {float(results[name]):.6g}" for name in sorted(results) if "loss" in name)
             print(f"pass {epoch + 1:>3} of {epochs}  {losses}", flush=True)
@@ -253,7 +253,7 @@ def report(recorded: Recorded) -> None:
     for reason, count in recorded.not_used.items():
         print(f"not used: {count} episodes {reason}")
     print(
-        f"own actions: {recorded.own} recorded, {recorded.inverted} computed from what was executed, of which "
+        f"own actions: {recorded.own} recorded, {recorded.inverted} computed from the executed ones, of which "
         f"{recorded.clipped} at a bound (the true ones may lie beyond it)",
         flush=True,
     )

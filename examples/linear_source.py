@@ -42,7 +42,7 @@ class Linear(Source):
             action_space=Box(-1.0, 1.0, (actions,), np.float32),
             steps=(),  # for example ObservationFilter(...)
             mode="given",  # the network gives the action itself
-            transform="clip",  # what happens to it then
+            transform="clip",  # the transform of a drawn action
             distribution=None,
         )
         module = torch.nn.Linear(observations, actions, bias=False)

@@ -8,7 +8,7 @@
 robo-gym pins an old protobuf, so it cannot share an environment with Ray: docs/how-to/robo-gym.md says how to make its
 own, and what must be done before `--rs-address` drives a real robot.
 
-Standard output has the report only: what robo-gym prints goes to standard error. Exit codes: 0, 1 for what failed, 2
+Standard output has the report only: robo-gym's own output goes to standard error. Exit codes: 0, 1 for a failure, 2
 for a wrong argument, 130 for Ctrl-C, after which no simulator is left.
 """
 
@@ -39,7 +39,7 @@ POLICIES = {
     "ObstacleAvoidanceMir100": "mir100_obstacle_avoidance",
 }
 UR_MODELS = ("ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e", "ur16e")
-MANAGER_PORTS = range(50100, 50200)  # where robo-gym looks for a server manager
+MANAGER_PORTS = range(50100, 50200)  # robo-gym looks for a server manager here
 ANSWER_S = 5.0  # [s] to connect, and again to answer; robo-gym itself waits 20 s for each of a hundred ports
 VERIFY = "/robo_gym_server_manager.grpc_msgs.server_manager.ServerManager/VerifyConnection"
 GET_STATE = "/robot_server.RobotServer/GetState"
@@ -133,7 +133,7 @@ def import_robo_gym() -> None:
 def locate_robot(args: argparse.Namespace) -> tuple[str, dict[str, Any]]:
     """Return the environment's id and arguments, for a manager or a robot server that answers.
 
-    Raises UnavailableError when none does: robo-gym would try for minutes, and not say what.
+    Raises UnavailableError when none does: robo-gym would try for minutes without a message.
     """
     ur = {"ur_model": args.ur_model or "ur5"} if args.task.endswith("UR") else {}
     if args.rs_address:
@@ -156,7 +156,7 @@ def answers(host: str, port: int, method: str) -> bool:
         socket.create_connection((host, port), timeout=ANSWER_S).close()
     except ConnectionRefusedError:
         return False
-    except (OSError, UnicodeError) as error:  # the other ports of this host would tell the same, each as slowly
+    except (OSError, UnicodeError) as error:  # the other ports of this host would fail the same way, each as slowly
         raise errors.UnavailableError(f"{host}:{port} cannot be reached: {error}") from error
     ask_directly(host)
     with grpc.insecure_channel(f"[{host}]:{port}" if ":" in host else f"{host}:{port}") as channel:
@@ -242,9 +242,7 @@ def sentences(what: str) -> Iterator[None]:
         raise errors.UnavailableError(f"{what}: the robot server does not answer ({reason})") from error
     except Exception as error:  # robo-gym's own tree, AssertionError, RuntimeError, Exception
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise errors.RlservoError(
-            f"{what}: {reason}; the log of the server manager or robot server says why"
-        ) from error
+        raise errors.RlservoError(f"{what}: {reason}; see the log of the server manager or robot server") from error
 
 
 def end_simulator(env: Any) -> None:
@@ -252,7 +250,7 @@ def end_simulator(env: Any) -> None:
     try:
         env.kill_sim()
     except Exception as error:  # its manager is gone, and with it the robot server
-        print(f"the robot server could not be told to end: {error}", file=sys.stderr)
+        print(f"the robot server could not be stopped: {error}", file=sys.stderr)
     env.expect_sim_running = False  # or `__del__` tries ten times more
 
 

@@ -6,7 +6,7 @@
     python examples/simple_trainer.py --resume runs/PPO-CartPole-v1-20260101-120000
 
 `--num-cpus N` is N cores for env runners, one each, and one more core for the driver, which holds the learner: on a
-node of 36 cores, `--num-cpus 35`. Where the machine has just N cores, the driver shares them (it waits while the others
+node of 36 cores, `--num-cpus 35`. If the machine has just N cores, the driver shares them (it waits while the others
 sample). `--num-cpus 0` samples in the driver. The run ends in a bundle that `rlservo serve` can serve.
 """
 
@@ -69,13 +69,13 @@ OLD_ARGUMENTS = {
     "--local-dir": "--storage",
     "--restore": "--resume",
 }
-AFTER_RESUME = ("resume", "address")  # what may be said beside --resume; everything else is the saved run's
+AFTER_RESUME = ("resume", "address")  # allowed with --resume; everything else is the saved run's
 
 
 def argument_parser() -> argparse.ArgumentParser:
     """Return the parser; its groups are what a person looks for together."""
     parser = argparse.ArgumentParser(
-        description="Train any RLlib algorithm on any Gymnasium environment; end in a policy bundle.",
+        description="Train any RLlib algorithm on any Gymnasium environment and export a policy bundle.",
         usage="%(prog)s [--run PPO] [--name-env CartPole-v1] [--num-cpus N] ...  (--help lists all)",
         formatter_class=DefaultsFormatter,
         allow_abbrev=False,
@@ -95,7 +95,9 @@ def argument_parser() -> argparse.ArgumentParser:
     what.add_argument("--seed", type=int, default=0, help="of training; episodes afterwards use 10000 and up")
 
     where = parser.add_argument_group("on what")
-    where.add_argument("--num-cpus", type=int, default=1, help="cores for env runners, one each; one more is driver's")
+    where.add_argument(
+        "--num-cpus", type=int, default=1, help="cores for env runners, one each; the driver takes one more"
+    )
     where.add_argument("--num-gpus", type=float, default=0.0, help="GPUs for learning, divided among the learners")
     where.add_argument("--num-envs-per-env-runner", type=int, default=1, help="environments in each env runner")
     where.add_argument("--num-learners", type=int, default=0, help="learner processes; 0 learns in the driver")
@@ -107,16 +109,20 @@ def argument_parser() -> argparse.ArgumentParser:
     until.add_argument("--stop-iters", type=int, default=200, help="training iterations at most")
     until.add_argument("--stop-timesteps", type=int, default=10_000_000, help="environment steps at most")
     until.add_argument("--stop-reward", type=float, default=float("inf"), help="mean return at which to stop")
-    until.add_argument("--resume", type=Path, metavar="RUN", help="go on with a run that was stopped, as it was set up")
+    until.add_argument("--resume", type=Path, metavar="RUN", help="resume a stopped run with its own settings")
 
     faults = parser.add_argument_group("when something fails")
     bool_flag = argparse.BooleanOptionalAction
-    faults.add_argument("--restart-failed-env-runners", action=bool_flag, default=True, help="restart a lost one")
-    faults.add_argument("--ignore-env-runner-failures", action=bool_flag, default=False, help="go on with the others")
     faults.add_argument(
-        "--restart-failed-sub-environments", action=bool_flag, default=False, help="remake a crashed one"
+        "--restart-failed-env-runners", action=bool_flag, default=True, help="restart a lost env runner"
     )
-    faults.add_argument("--max-num-env-runner-restarts", type=int, default=1000, help="then the training fails")
+    faults.add_argument(
+        "--ignore-env-runner-failures", action=bool_flag, default=False, help="continue with the others"
+    )
+    faults.add_argument(
+        "--restart-failed-sub-environments", action=bool_flag, default=False, help="recreate a crashed environment"
+    )
+    faults.add_argument("--max-num-env-runner-restarts", type=int, default=1000, help="failures that end the training")
     faults.add_argument("--max-failures", type=int, default=0, help="how often a trial continues from its checkpoint")
 
     group = parser.add_argument_group("what is written")
@@ -124,13 +130,15 @@ def argument_parser() -> argparse.ArgumentParser:
     group.add_argument("--checkpoint-frequency", type=int, default=5, help="iterations between checkpoints")
     group.add_argument("--evaluation-interval", type=int, default=0, help="iterations between evaluations; 0 is none")
     group.add_argument("--evaluation-duration", type=int, default=10, help="episodes of an evaluation")
-    group.add_argument("--evaluation-num-env-runners", type=int, default=0, help="further cores for it; 0: the driver")
     group.add_argument(
-        "--log-level", choices=["DEBUG", "INFO", "WARN", "ERROR"], default="ERROR", help="RLlib's and Ray's"
+        "--evaluation-num-env-runners", type=int, default=0, help="extra cores for evaluation; 0: the driver's"
     )
-    group.add_argument("--output", type=Path, help="folder for episode traces: what was seen, done and earned")
+    group.add_argument(
+        "--log-level", choices=["DEBUG", "INFO", "WARN", "ERROR"], default="ERROR", help="log level of RLlib and Ray"
+    )
+    group.add_argument("--output", type=Path, help="folder for episode traces: observations, actions, rewards")
     group.add_argument("--export", type=Path, help="folder for the best checkpoint's bundle; default: STORAGE/policies")
-    group.add_argument("--no-export", action="store_true", help="end with the checkpoint")
+    group.add_argument("--no-export", action="store_true", help="do not export a bundle")
     group.add_argument("--episodes", type=int, default=10, help="episodes with the bundle afterwards")
 
     sweep = parser.add_argument_group("hyper-parameter sweep")
@@ -139,8 +147,8 @@ def argument_parser() -> argparse.ArgumentParser:
     sweep.add_argument("--num-samples", type=int, default=1, help="times the space is drawn from")
     sweep.add_argument("--scheduler", choices=["fifo", "asha", "median"], default="fifo", help="stops bad trials early")
     sweep.add_argument("--max-concurrent-trials", type=int, help="trials at once; default: as many as fit")
-    sweep.add_argument("--metric", default=RETURN, help="what the best checkpoint has most of")
-    sweep.add_argument("--mode", choices=["max", "min"], default="max", help="or least")
+    sweep.add_argument("--metric", default=RETURN, help="metric that picks the best checkpoint")
+    sweep.add_argument("--mode", choices=["max", "min"], default="max", help="pick its smallest value")
     for old in OLD_ARGUMENTS:
         parser.add_argument(old, nargs="?", action=_NewName, help=argparse.SUPPRESS, default=argparse.SUPPRESS)
     return parser
@@ -291,7 +299,7 @@ def algorithm_config(
 
 
 def observation_steps(space: Any, kind: str) -> Any:
-    """Return RLlib's connectors between environment and network, or None where it needs none.
+    """Return RLlib's connectors between environment and network, or None if it needs none.
 
     What is flattened is made one vector: choices one-hot, Dict and Tuple in the space's order, images pixel by pixel.
     uint8 is not scaled.
@@ -300,7 +308,7 @@ def observation_steps(space: Any, kind: str) -> Any:
     has_filter = kind == "MeanStdFilter"
     if has_filter and (not isinstance(space, Box) or np.dtype(space.dtype).kind != "f"):
         raise errors.UsageError(
-            f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, {space} is none"
+            f"--observation-filter MeanStdFilter needs a Box of floating-point numbers, got {space}"
         )
     if not (flatten or has_filter):
         return None
@@ -312,7 +320,7 @@ def observation_steps(space: Any, kind: str) -> Any:
 
 
 def is_flattened(space: Any) -> bool:
-    """Whether the network is to see a vector: all but a vector, and an image of a size RLlib has convolutions for."""
+    """Whether the network sees a vector: all but a vector, and an image of a size RLlib has convolutions for."""
     return not (isinstance(space, Box) and (len(space.shape) == 1 or _is_known_image(space)))
 
 
@@ -421,9 +429,7 @@ def main() -> None:
     training_run.pickle_by_value(sys.modules[__name__], episode_traces)
     if args.resume:
         if more := sorted(explicit(sys.argv[1:]) - set(AFTER_RESUME)):
-            raise errors.UsageError(
-                f"--resume goes on with the run as it was set up: leave --{more[0].replace('_', '-')} out"
-            )
+            raise errors.UsageError(f"--resume uses the run's own settings: leave --{more[0].replace('_', '-')} out")
         run, _ = training_run.load_run(args.resume)
         if args.address is None and run.request:  # runs of before have none
             check_machine(run)

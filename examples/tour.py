@@ -34,7 +34,7 @@ EXPLORATION_STEPS = 5_000  # steps on FrozenLake, after which it hardly explores
 
 @dataclass(frozen=True)
 class Settings:
-    """How long everything takes."""
+    """Durations of the tour's parts."""
 
     out: Path
     quick: bool
@@ -46,15 +46,15 @@ class Settings:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="RLlib's introduction, on today's Ray, ending in bundles and videos.")
+    parser = argparse.ArgumentParser(description="A tour of RLlib on current Ray, up to bundles and videos.")
     parser.add_argument("stops", nargs="*", metavar="STOP", help="cartpole, frozenlake, ur5 (default: all three)")
     parser.add_argument("--out", type=Path, default=Path("tour"), help="folder for runs, bundles and videos")
-    parser.add_argument("--quick", action="store_true", help="train for moments only")
+    parser.add_argument("--quick", action="store_true", help="train only briefly")
     parser.add_argument("--no-video", action="store_true", help="draw nothing, without OpenGL")
     args = parser.parse_args()
     stops: dict[str, Callable[[Settings], None]] = {"cartpole": cartpole, "frozenlake": frozen_lake, "ur5": ur5}
     if unknown := [stop for stop in args.stops if stop not in stops]:
-        parser.error(f"{unknown[0]} is no stop of the tour: expected {', '.join(stops)}")
+        parser.error(f"{unknown[0]} is not a stop of the tour: expected {', '.join(stops)}")
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws CartPole without a display
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")  # and looks for a sound card
     training_run.pickle_by_value(sys.modules[__name__])
@@ -64,18 +64,18 @@ def main() -> None:
         for stop in args.stops or stops:
             stops[stop](settings)
     except training_run.InterruptError:
-        raise KeyboardInterrupt from None  # a tour begins anew
+        raise KeyboardInterrupt from None  # a tour cannot be resumed
 
 
 def heading(text: str) -> None:
     print(f"\n=== {text}", flush=True)
 
 
-# What every environment gets.
+# Arguments of every environment.
 
 
 def look_at(env_id: str, **arguments: Any) -> None:
-    """Print what an environment says of itself, and check that it keeps to it."""
+    """Print an environment's description of itself, and check that it is true."""
     env = gym.make(env_id, **arguments)
     spec = env.spec
     assert spec is not None  # gym.make's always have one
@@ -279,7 +279,7 @@ def frozen_lake(settings: Settings) -> None:
     log.mkdir(parents=True)
     config.debugging(seed=1)
     with training_run.ray_session(num_cpus=1), training_run.stopping(training_run.build(config)) as algorithm:
-        steps, is_solved = 0, False  # one episode tells: without slipping, every episode of a policy is the same
+        steps, is_solved = 0, False  # one episode is enough: without slipping, every episode of a policy is the same
         while not (is_solved and (settings.quick or steps >= EXPLORATION_STEPS)) and steps < 4 * EXPLORATION_STEPS:
             result = training_run.iterate(algorithm)
             steps = result[STEPS]

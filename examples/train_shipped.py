@@ -1,13 +1,13 @@
-"""Train one of the policies in examples/checkpoints again, from the settings that stand beside it.
+"""Train one of the policies in examples/checkpoints again, from the settings next to it.
 
     python examples/train_shipped.py mir100_obstacle_avoidance
 
 `examples/checkpoints/NAME/training.yaml` says what is trained and when to stop; `--seed`, `--set` and `--settings`
 change that for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or,
-where the settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and
-`curve.png`. `--install` then puts the pruned checkpoint and the curve beside the settings. One process, one thread:
+if the settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and
+`curve.png`. `--install` then puts the pruned checkpoint and the curve next to the settings. One process, one thread:
 RLlib samples in the driver, so that a run gives the same numbers again. How good a policy is afterwards
-`evaluate_shipped.py` tells, on other seeds.
+`evaluate_shipped.py` measures, on other seeds.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ from rlservo.export.rllib.batched_connectors import use_batched_connectors
 assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 FILTER = "env_to_module_connector"
-MODULE = "learner_group/learner/rl_module/default_policy"  # where a checkpoint has its network
+MODULE = "learner_group/learner/rl_module/default_policy"  # path of the network in a checkpoint
 MILESTONE = 0.95  # the success rate whose time is printed
 GAINS = {"encoder": 2**0.5, "pi": 0.01, "vf": 1.0}  # of orthogonal weights, by the network's parts
 NEEDED = ("env", "algorithm", "seed", "envs", "filter", "stop")  # of training.yaml
-SHAPING = ("bounds_loss_coeff", "smoothness_loss_coeff", "largest_std")  # what ActionPenaltyLearner knows
+SHAPING = ("bounds_loss_coeff", "smoothness_loss_coeff", "largest_std")  # settings of ActionPenaltyLearner
 FAILED_KEPT = 16  # episodes, by each environment
 CURVE = ("env_steps", "episodes", "mean_return", "mean_length", "success", "wall_s", "cpu_s")  # a Row's, in the file
 SUMS = ("episodes", "judged", "return", "length", "success")
@@ -75,7 +75,7 @@ class Row:
     success: float
     wall_s: float
     cpu_s: float
-    trained_steps: float  # what the learner has seen of them, each as often as it was seen
+    trained_steps: float  # steps that the learner has seen, repetitions counted
 
 
 def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
@@ -86,7 +86,7 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     # Under the environment's own name, which checkpoints keep: one that is restored elsewhere has no wrapper.
     if chosen["failed_share"] or chosen["out_of_reach_share"]:
         register_env(settings["env"], functools.partial(_make_chosen, settings["env"], chosen))
-    else:  # what a training before this one, in the same process, has registered
+    else:  # registered by an earlier training in the same process
         _global_registry.unregister(ENV_CREATOR, settings["env"])
     config.env_runners(
         num_env_runners=0,
@@ -113,7 +113,7 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     shaping = {name: settings[name] for name in SHAPING if settings.get(name)}
     if "largest_std" in shaping and not settings.get("model", {}).get("free_log_std"):
         raise errors.UsageError(
-            "largest_std bounds a standard deviation that is no output: set model.free_log_std=true"
+            "largest_std bounds a standard deviation that is not an output: set model.free_log_std=true"
         )
     if shaping:
         config.training(learner_class=ActionPenaltyLearner)
@@ -140,13 +140,13 @@ class ChosenEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     failure here.) Of the others a share has its target out of reach, by the environment's `extreme_options`: all that
     can be done there is to wait until the time is over.
 
-    Episodes are the same again by their seed. `info["is_ordinary"]` says which are neither.
+    The same seed gives the same episode. `info["is_ordinary"]` marks those that are neither.
     """
 
     def __init__(
         self, env: gymnasium.Env[Any, Any], *, failed_share: float = 0.0, out_of_reach_share: float = 0.0
     ) -> None:
-        """Raise UsageError for an environment that has no targets out of reach, where a share is to have one."""
+        """Raise UsageError for an environment without targets out of reach, if a share of episodes needs one."""
         super().__init__(env)
         if out_of_reach_share and not isinstance(env.unwrapped, HasExtremes):
             raise errors.UsageError(f"out_of_reach is {out_of_reach_share}: {env.unwrapped} has no extreme_options")
@@ -173,7 +173,7 @@ class ChosenEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
         has_failed = (terminated or truncated) and not info.get("is_success", True)
-        if has_failed and not self._is_out_of_reach:  # which nobody succeeds in
+        if has_failed and not self._is_out_of_reach:  # in which no policy succeeds
             self._failed.append(self._episode)
         return observation, reward, terminated, truncated, {**info, "is_ordinary": self._is_ordinary}
 
@@ -195,15 +195,15 @@ def _make_chosen(env_id: str, shares: dict[str, float], env_config: dict[str, An
 class ActionPenaltyLearner(PPOTorchLearner):
     """PPO that also shapes the Gaussian it draws actions from. `learner_config_dict` says how:
 
-    `bounds_loss_coeff`: what a mean outside the action's bounds costs, by the square of how far it is outside. Actions
+    `bounds_loss_coeff`: cost of a mean outside the action's bounds, by the square of its distance. Actions
     are clipped there: with a mean of -2 whatever is drawn is -1, so that nothing is learned of driving slower.
     rl_games, with which Isaac Gym's robots were trained, has it as `bounds_loss_coef`.
 
-    `smoothness_loss_coeff`: what the mean's step from one observation to the next costs, by its square. Source: Mysore
+    `smoothness_loss_coeff`: cost of the mean's step from one observation to the next, by its square. Source: Mysore
     et al., Regularizing action policies for smooth control with reinforcement learning, 2021 (their temporal term).
 
     `largest_std`: the standard deviations' upper bound over environment steps, `[[0, 1.0], [1000000, 0.2]]`, of a
-    network with `free_log_std`. What is learned in the end is then learned near the actions that are taken later.
+    network with `free_log_std`. The last part is then learned near the actions that are taken later.
     """
 
     def build(self) -> None:
@@ -264,7 +264,7 @@ def _draw_orthogonal(*, algorithm: Algorithm, **_: Any) -> None:
 
 def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:
     # Sums: RLlib's own means and windows are of one iteration's episodes, which are few or many.
-    chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut where a sampling phase ended
+    chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut at the end of a sampling phase
     total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))
     info = episode.get_infos(-1) or {}
     if not info.get("is_ordinary", True):
@@ -315,7 +315,7 @@ def read_settings(path: Path) -> dict[str, Any]:
         raise errors.UsageError(f"{path}: no YAML: {error}") from error
     missing = [name for name in NEEDED if not isinstance(settings, dict) or name not in settings]
     if missing:
-        raise errors.UsageError(f"{path}: has no {missing[0]}; {SHIPPED}/*/training.yaml show what there is")
+        raise errors.UsageError(f"{path}: has no {missing[0]}; {SHIPPED}/*/training.yaml are examples")
     return cast("dict[str, Any]", settings)
 
 
@@ -329,7 +329,7 @@ def change_settings(settings: dict[str, Any], changes: list[str]) -> None:
             where = where.get(parent) if isinstance(where, dict) else None
         if not equals or not isinstance(where, dict) or last not in where:
             raise ValueError(
-                f"--set {change}: expected KEY=VALUE with a key that training.yaml has, say stop.env_steps=20000"
+                f"--set {change}: expected KEY=VALUE with a key that training.yaml has, such as stop.env_steps=20000"
             )
         where[last] = yaml.safe_load(value)
 
@@ -469,10 +469,10 @@ def train(
                 if (is_full and value >= stop["value"]) or row.env_steps >= stop["env_steps"]:
                     break
     except KeyboardInterrupt:
-        print("interrupted: what has been reached is kept")
+        print("interrupted: the results so far are kept")
     finally:
         has_learned = bool(rows) and rows[-1].trained_steps > 0
-        if best == float("-inf") and has_learned:  # too short for a first mean: a checkpoint all the same
+        if best == float("-inf") and has_learned:  # too short for a first mean: a checkpoint nevertheless
             algorithm.save_to_path(str(checkpoint.resolve()))
         algorithm.stop()
     if not has_learned:
@@ -482,7 +482,7 @@ def train(
 
 
 def draw(rows: list[Row], title: str, path: Path) -> None:
-    """Draw return, and success where the environment tells of it, over environment steps."""
+    """Draw return, and success if the environment reports it, over environment steps."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -517,12 +517,12 @@ def install(name: str, folder: Path) -> None:
 
 def main() -> None:
     names = sorted(path.parent.name for path in SHIPPED.glob("*/training.yaml"))
-    parser = argparse.ArgumentParser(description="Train one of the policies that ship again.")
+    parser = argparse.ArgumentParser(description="Retrain one of the shipped policies.")
     parser.add_argument("name", choices=names)
     parser.add_argument("--seed", type=int, help="instead of the one in training.yaml")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
-        help="change a setting of training.yaml for this run, say stop.env_steps=20000 or model.use_lstm=false",
+        help="change a setting of training.yaml for this run, such as stop.env_steps=20000 or model.use_lstm=false",
     )  # fmt: skip
     parser.add_argument("--settings", type=Path, help="a file of your own instead of the policy's training.yaml")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")
@@ -539,10 +539,10 @@ def main() -> None:
     folder = args.storage / args.name
     folder.mkdir(parents=True, exist_ok=True)
 
-    # Checkpoints hold functions of this file. Pickled by value, they load where it does not exist.
+    # Checkpoints hold functions of this file. Pickled by value, they load without it.
     cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
-    config = algorithm_config(settings, seed)  # what is wrong in the settings is said before Ray starts
+    config = algorithm_config(settings, seed)  # wrong settings are reported before Ray starts
     with ray_session(num_cpus=1):
         rows = train(config, settings, folder, beginning)
     draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")

@@ -27,13 +27,13 @@ def default_name(env_id: str | None, env_config: Mapping[str, Any], root: Path) 
 
 
 def bundle_name(base: str, module_id: str, agent_id: str | None) -> str:
-    """Return the name of one policy of several: what is not allowed in a name becomes '-'."""
+    """Return the name of one policy of several; characters that a name may not have become '-'."""
     parts = [base, module_id, *([agent_id] if agent_id else [])]
     return re.sub(r"[^A-Za-z0-9._-]+", "-", "-".join(parts))[:64].rstrip("-.")
 
 
 def check_names(name: str | None, version: str | None) -> None:
-    """Raise UsageError when a name or a version that was asked for cannot be one."""
+    """Raise UsageError when a requested name or version is not valid."""
     if name is not None and not re.fullmatch(NAME_PATTERN, name):
         raise UsageError(f"'{name}' cannot be a policy's name: expected up to 64 letters, digits, '.', '_' and '-'")
     if version is not None and not re.fullmatch(VERSION_PATTERN, version):

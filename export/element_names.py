@@ -27,7 +27,7 @@ from rlservo.export.sources.restored_policy import ElementNames
 def read_elements(
     env_id: str | None, env_config: Mapping[str, Any], recipe: Recipe, notify: Callable[[str], None]
 ) -> ElementNames:
-    """Return what the environment's class says of its elements."""
+    """Return the element names of the environment's class."""
     if env_id is None:
         return ElementNames()
     try:

@@ -117,14 +117,13 @@ def export_checkpoint(
     """Export one policy of a checkpoint to `out/<name>/<version>/`.
 
     `checkpoint` is a path that a source knows (docs/how-to/sources.md), or a URI of such a folder; `source` names the
-    source, which the path tells otherwise. `name` defaults to the environment's (of several policies with the module's
-    behind it), `version` to the next integer after the newest one present.
-    `app_dir` holds the user's own classes, if the checkpoint needs any. `value` False leaves the value head out, which
-    other servers compute for each action, too: a third of a small policy's time. `untrained_filter` also exports an
-    observation filter whose statistics are empty, or only evaluation's. `vecnormalize` and `frame_stack` are for
-    Stable-Baselines3: its observation statistics, where they are not beside the model, and how many frames it stacked.
-    `notify` gets one sentence for each thing a person should know (by default they are logged), `progress` what is
-    being done.
+    source, by default recognised from the path. `name` defaults to the environment's (of several policies with the
+    module's behind it), `version` to the next integer after the newest one present. `app_dir` holds the user's own
+    classes, if the checkpoint needs any. `value` False leaves the value head out, which other servers compute for each
+    action, too: a third of a small policy's time. `untrained_filter` also exports an observation filter whose
+    statistics are empty, or only evaluation's. `vecnormalize` and `frame_stack` are for Stable-Baselines3: its
+    observation statistics, if they are not beside the model, and the number of frames it stacked. `notify` gets one
+    sentence for each thing a person should know (by default they are logged), `progress` what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give the trainer's own actions. Nothing is left behind then.
@@ -267,7 +266,7 @@ def _build(
 
 
 def _check_filter(files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPolicy, options: ExportOptions) -> None:
-    """Raise CheckpointError for an observation filter that training has not filled, unless it was asked for."""
+    """Raise CheckpointError for an observation filter that training has not filled, unless it was allowed."""
     steps, frozen = facts.env_steps, restored.recipe.filter
     trained = "how long training took is unknown" if steps is None else f"training took {steps:,} environment steps"
     if why := restored.untrained_filter:

@@ -50,7 +50,7 @@ def export_policy(
 
     The module takes an observation `[batch, *shape]` (of a Dict space a dict, floating-point numbers in single
     precision) and gives for a Box the action `[batch, *shape]`, for a Discrete or MultiDiscrete one score for each
-    choice `[batch, n]`. What goes to the robot is `action * scale + offset`, with `clip` clipped to the space's bounds.
+    choice `[batch, n]`. The robot gets `action * scale + offset`, with `clip` clipped to the space's bounds.
     A recurrent module takes one tensor `[batch, ...]` for each entry of `state` after the observation, and returns a
     tuple of the action and the next ones; the entries are what an episode starts with, without the batch axis.
     Names and units are one for each element in row-major order. The module itself is left as it is.

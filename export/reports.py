@@ -24,7 +24,7 @@ CHANGING = ("logarithm", "sine_and_cosine", "user_connector")  # steps after whi
 
 
 def contract_report(contract: Contract) -> RenderableType:
-    """Return the whole contract: what it is, what goes in, what is baked in, what comes out, how it was proven."""
+    """Return the whole contract as text: inputs, baked-in steps, outputs and proof."""
     parts: list[RenderableType] = [
         _summary(contract),
         *_space_tables("Goes in: observation", "obs", contract.observation_space, _filter(contract)),
@@ -118,7 +118,7 @@ def _exploration(contract: Contract) -> str:
 
 
 def _space_tables(title: str, root: str, space: SpaceSpec, frozen: BakedStep | None) -> list[RenderableType]:
-    """Return one table of all leaves, then one of the elements of each leaf of which more is known than its bounds."""
+    """Return one table of all leaves, then one of the elements of each leaf with more than bounds."""
     leaves = leaf_specs(space, root)
     detailed = [name for name, leaf in leaves.items() if leaf.elements or _seen(frozen, leaf.size)[0]]
     parts: list[RenderableType] = []

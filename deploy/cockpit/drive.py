@@ -1,6 +1,6 @@
 """The drive: a thread in which a policy drives a simulated robot in real time, and a second version its ghost.
 
-Whoever draws it reads `view`, `history` and `notes`, which are replaced as a whole, and asks for changes with `do`:
+The page reads `view`, `history` and `notes`, which are replaced as a whole, and asks for changes with `do`:
 they are made between two control cycles. It knows nothing of pages and browsers.
 """
 
@@ -74,7 +74,7 @@ class Drive:
         self._ghost: Ghost | None = None
         self._commands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._dragged: dict[Callable[[Vector], None], Vector] = {}  # what was dragged, and has not been put there yet
+        self._dragged: dict[Callable[[Vector], None], Vector] = {}  # dragged, but not moved yet
         self._thread = threading.Thread(target=self._run, name="cockpit-drive", daemon=True)
         self._phase: Phase = "driving"
         self._start: Start = "own"
@@ -93,7 +93,7 @@ class Drive:
 
     @property
     def choice(self) -> Choice:
-        """The policy that drives, as it was asked for."""
+        """The policy that drives, as requested."""
         return self._choice
 
     def start(self) -> None:
@@ -132,7 +132,7 @@ class Drive:
             self.pause()
 
     def begin(self, start: Start, *, keep_target: bool = False) -> None:
-        """Begin an episode now; later ones that do not continue from where the robot is start alike."""
+        """Begin an episode now; later ones that do not continue from the robot's pose start the same way."""
         if start != "here":
             self._start = start
         self._is_users_target = self._is_users_target and keep_target
@@ -235,7 +235,7 @@ class Drive:
             command()
         except (RlservoError, ValueError) as error:
             return str(getattr(error, "message", None) or error)
-        except Exception as error:  # an environment is anyone's code, and a thread that ends says nothing
+        except Exception as error:  # an environment is anyone's code, and a thread that ends reports nothing
             logger.exception("the cockpit's drive failed")
             self._phase = "paused"
             return f"{type(error).__name__}: {error}"
@@ -292,9 +292,9 @@ class Drive:
         return self._policy.act(self._obs, **reward)
 
     def _wait_for_server(self, error: RlservoError) -> None:
-        """Say it, and ask again soon: the robot stands, and what it sees has not changed."""
+        """Report it and ask again soon: the robot holds still, so its observation has not changed."""
         self._late += isinstance(error, DeadlineError)
-        self._trouble = f"waiting for the policy, the robot stands: {error.message}"
+        self._trouble = f"waiting for the policy; the robot holds still: {error.message}"
         self._before = self._after
         self._due = time.perf_counter() + RETRY_S
         if isinstance(error, UnknownPolicyError):  # a server that was started again, with other versions
@@ -358,13 +358,13 @@ class Drive:
         self._sentence = f"Episode {self._episodes + 1} runs."
 
     def _end(self, info: Mapping[str, Any], *, is_arrival: bool) -> None:
-        """Count an episode, and say how it continues: from where the robot is, but after a failure."""
+        """Count an episode and report it; the next one continues from the robot's pose, except after a failure."""
         is_success, status = bool(success_of(info)), info.get("final_status")
         self._episodes += 1
         self._successes += is_success
         if is_arrival and self._is_users_target:
             self._phase = "arrived"
-            self._sentence = "Arrived. Drag the target on, or let a new one be drawn."
+            self._sentence = "Arrived. Drag the target, or draw a new one."
             return
         goes_on = is_success or status == "max_steps_exceeded"
         self._next = ("here" if goes_on else self._start, self._is_users_target)
@@ -413,7 +413,7 @@ class Drive:
         return [self._stage] if self._ghost is None else [self._stage, self._ghost.stage]
 
     def _stage_for(self, contract: Contract, choice: Choice, arguments: Mapping[str, Any] | None) -> Stage:
-        """Return the stage that is there where a policy fits it, else a new one."""
+        """Return the present stage if the policy fits it, else a new one."""
         if arguments is None:
             if choice.name == self._choice.name:
                 self._stage.check(contract)
@@ -432,7 +432,7 @@ class Drive:
 
     def _refuse_second_robot(self, what: str) -> None:
         if getattr(self._stage.env, "is_real", False):
-            raise UsageError(f"{what} cannot be had beside a real robot: start the cockpit again")
+            raise UsageError(f"{what} cannot be combined with a real robot: restart the cockpit")
 
     def _drop_ghost(self) -> None:
         if self._ghost is not None:

@@ -40,7 +40,7 @@ def checked_messages() -> Iterator[None]:
         logger.addFilter(_shorten)
     try:
         with warnings.catch_warnings():
-            # viser warns, and continues with a position of two numbers, say, which later ends the drawing.
+            # viser warns, and continues with a position of, for example, two numbers, which later ends the drawing.
             warnings.filterwarnings("error", message=r"\[viser\] .* does not match annotation")
             yield
     finally:

@@ -54,7 +54,7 @@ def floor_lines(extent: float) -> bytes:
     """Return a grid on the floor as glTF, about four times as wide as `extent` [m]: plain lines, a pixel wide.
 
     viser's own grid, and any floor that is filled, takes a third of a frame without a graphics card. Each line is cut
-    where it crosses another: of one that ends behind the camera, software draws nothing.
+    at crossings: software rendering drops a line that ends behind the camera.
     """
     cells = 4 * int(4 * extent / (4 * CELL_M))  # whole metres to both sides
     at = CELL_M * (np.arange(cells + 1) - cells / 2)

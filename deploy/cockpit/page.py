@@ -27,7 +27,7 @@ HOST = "127.0.0.1"
 FRAME_S = 1 / 30
 NEARER = 0.62  # tan(45 / 2) / tan(75 / 2), about: MuJoCo's angle of view to viser's
 NARROW = 0.75  # of a window's width to its height, below which it is a phone's
-FARTHER, SHEET = 1.7, 0.6  # what a phone's camera makes of that: distance, and height of the middle above the window's
+FARTHER, SHEET = 1.7, 0.6  # the same for a phone's camera: distance, and height of the middle above the window's
 PANEL_S = 0.5  # between two refreshes of numbers and plots: drawn in software, one costs as much as a frame
 HOSTS = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")  # of any port: one may be forwarded to ours
 # viser's page is one file, which unpacks itself and compiles a part of its scripts from strings.
@@ -192,5 +192,5 @@ def _refusal(headers: Any) -> str:
         return f"the host {host[:100]!r} is not this machine: the cockpit is at {HOST}"
     origins = headers.get_all("Origin")
     if any(origin.lower() not in (f"http://{host}", f"https://{host}") for origin in origins):
-        return f"a page of {', '.join(origins)[:100]} may not use the cockpit"
+        return f"a page from {', '.join(origins)[:100]} may not use the cockpit"
     return ""

@@ -1,4 +1,4 @@
-"""The panel of a recording: its episodes to scrub through, and where a replay differs most."""
+"""The panel of a recording: episodes to scrub through, and the moments at which a replay differs most."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rlservo.serve_app.replay.follower import Follower
 from rlservo.serve_app.replay.replay import Moment, replay
 
 MOST_EPISODES = 500  # in memory
-# What a recording has no position for is left out: the room and the cubes round a MiR100.
+# Objects whose position is not recorded are left out: the room and the cubes round a MiR100.
 EMPTY_FLOOR = "rlservo/NoObstacleNavigationMir100Sim-v0"
 NO_MOMENT = "-"
 WAYS = {"Pause": 0, "Back": -1, "Step": 1}
@@ -40,7 +40,7 @@ class Tape:
         self.differences: list[NDArray[Any]] = []
         """Of the bundle's actions from the recorded ones, by episode; NaN if they are not known."""
         self.moments: list[Moment] = []
-        """Where they differ most."""
+        """The moments at which they differ most."""
         self.episodes: list[Episode] = []
         if bundle is None:
             self.episodes = list(islice(_of_one_policy(recording, policy), MOST_EPISODES))
@@ -49,7 +49,8 @@ class Tape:
                 self.episodes.append(followed.episode)
                 if "action" not in followed.action:
                     raise UsageError(
-                        f"the actions of {followed.episode.policy.title} are nested, which none of rlservo's robots has"
+                        f"the actions of {followed.episode.policy.title} are nested: no robot of rlservo takes nested "
+                        "actions"
                     )
                 difference = followed.action["action"] - followed.episode.action["action"]
                 difference = difference.reshape(len(followed.episode), -1).astype(np.float64)
@@ -62,7 +63,7 @@ class Tape:
             self.moments = replay(recording, bundle, name=policy).worst
 
     def find(self, moment: Moment) -> tuple[int, int]:
-        """Return episode and row of a moment; the first ones where it is beyond the episodes in memory."""
+        """Return episode and row of a moment; the first ones if it is beyond the episodes in memory."""
         for number, episode in enumerate(self.episodes):
             rows = np.flatnonzero((episode.steps == moment.step) & (np.abs(episode.time_s - moment.time_s) < 1e-3))
             if episode.id == moment.episode and len(rows):
@@ -102,7 +103,7 @@ class PlaybackPanel:
         self._tape = tape
         contract = tape.contract
         home = env_id or home_of(contract)
-        Stage(home, home_arguments(contract), contract).close()  # or the sentence that says what does not fit
+        Stage(home, home_arguments(contract), contract).close()  # or an error about what does not fit
         self._stage = Stage(EMPTY_FLOOR if "Mir100" in home else home, home_arguments(contract))
         self._stage.begin()
         self._period_s = 1.0 / (contract.control_rate_hz or 10.0)

@@ -81,7 +81,7 @@ class ServedPolicies(PolicySource):
             deadline_ms=link.deadline_ms,
         )
         try:
-            _ = client.contract  # settles the version, or says now why not
+            _ = client.contract  # resolves the version, or fails now
             if link.fallback in ("hold", "zero", "stop"):
                 return WithFallback(client, link.fallback)
         except BaseException:

@@ -164,7 +164,7 @@ class Readings:
         self._panel.set_width(PANEL_WIDTH)
 
     def update(self, history: Sequence[Cycle], *, late_beyond_ms: float) -> list[str]:
-        """Show the last cycles; return what is to be said of the last observation."""
+        """Show the last cycles; return a remark on the last observation."""
         if not history:
             return []
         shown = history[-WINDOW:]

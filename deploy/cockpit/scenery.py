@@ -80,7 +80,7 @@ class Scenery:
         self._floor = server.scene.add_glb("/floor", floor, cast_shadow=False, receive_shadow=False)
 
     def offer_start(self, offered: bool) -> None:
-        """Show the robot's handle or the target's: where the robot has arrived, both would be in one place."""
+        """Show the robot's handle or the target's: once the robot has arrived, both would be in one place."""
         if self._start is not None:
             self._start.show(offered)
         if self._target is not None:

@@ -86,7 +86,7 @@ class Stage:
     ) -> Any:
         """Begin an episode, with the robot at `position` if that is given, and return its first observation.
 
-        One that cannot start there starts as `start` says, and one that cannot start so as the task has it.
+        An episode that cannot start there starts as `start` says, else as the task does.
         """
         options = self.env.reset_options(start=start, keep_target=keep_target)
         own = self.env.reset_options(keep_target=keep_target)
@@ -128,7 +128,7 @@ def home_of(contract: Contract) -> str:
     if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
         raise UsageError(
             f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, which the cockpit "
-            f"cannot draw: name one of rlservo's simulators that it fits with --env"
+            f"cannot draw: choose a matching simulator of rlservo with --env"
         )
     return env_id
 

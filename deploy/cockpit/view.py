@@ -15,7 +15,7 @@ Phase = Literal["driving", "paused", "arrived"]
 
 @dataclass(frozen=True)
 class Cycle:
-    """One control cycle: what the policy saw and did."""
+    """One control cycle: observation, action and their readings."""
 
     number: int  # since the drive began
     obs: NDArray[Any]
@@ -42,8 +42,8 @@ class View:
     ghost: tuple[Scene, Scene] | None
     ghost_contract: Contract | None
     phase: Phase
-    sentence: str  # what is being done
-    trouble: str  # what is wrong, or nothing
+    sentence: str  # current activity
+    trouble: str  # current fault, or empty
     refusal: str  # why the last command was not followed, or nothing
     episodes: int
     successes: int

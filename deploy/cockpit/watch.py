@@ -1,4 +1,4 @@
-"""The panel of a robot server: what its simulation does while robo-gym's own environment drives it."""
+"""The panel of a robot server: its simulation while robo-gym's own environment drives it."""
 
 from __future__ import annotations
 

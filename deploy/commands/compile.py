@@ -26,7 +26,7 @@ def compile(
     """Turn a bundle into one C99 file without dependencies. It is compiled and proven equal to onnxruntime.
 
     A difference is an error, and nothing is written. Without a C compiler the files are written and called unproven;
-    the self-test beside them proves them where there is one.
+    the self-test next to them proves them on a machine with one.
 
     Example: `rlservo compile policies/ur5 --out build`
     """

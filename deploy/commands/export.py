@@ -30,7 +30,7 @@ def export(
         bool, typer.Option("--all-modules", help="Export every module, each to OUT/<name>-<module>; all or none.")
     ] = False,
     agent_id: Annotated[
-        str | None, typer.Option(help="Agent to export for, if agents that share a module are filtered differently.")
+        str | None, typer.Option(help="Agent to export for, if agents that share a module have different filters.")
     ] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     value: Annotated[bool, typer.Option("--value/--no-value", help="Include the value head.")] = True,
@@ -42,13 +42,13 @@ def export(
         ),
     ] = False,
     source: Annotated[
-        str | None, typer.Option(help="Which trainer wrote it: rllib, sb3, rsl_rl, skrl, leapp; the path tells it.")
+        str | None, typer.Option(help="Trainer that wrote it (rllib, sb3, rsl_rl, skrl, leapp); recognised by default.")
     ] = None,
     vecnormalize: Annotated[
-        Path | None, typer.Option(help="Of Stable-Baselines3, vecnormalize.pkl where it is not beside the model.")
+        Path | None, typer.Option(help="Stable-Baselines3: vecnormalize.pkl, if it is not beside the model.")
     ] = None,
     frame_stack: Annotated[
-        int, typer.Option(min=1, help="Of Stable-Baselines3, how many frames VecFrameStack put into an observation.")
+        int, typer.Option(min=1, help="Stable-Baselines3: number of frames that VecFrameStack stacked.")
     ] = 1,
     metric: Annotated[
         str | None, typer.Option(help="Metric that picks the best checkpoint of a Tune trial or experiment.")

@@ -15,7 +15,7 @@ def key(
         bool, typer.Option("--admin", help="Make a key for administration; robots do not need one.")
     ] = False,
     explore: Annotated[
-        bool, typer.Option("--explore", help="Let the key ask for exploring actions, too ('rlservo learn').")
+        bool, typer.Option("--explore", help="Let the key also ask for exploring actions ('rlservo learn').")
     ] = False,
     rate: Annotated[
         float | None,

@@ -18,31 +18,31 @@ def learn(
     checkpoint: Annotated[Path, typer.Argument(help="A whole checkpoint of RLlib's PPO (new API stack), not pruned.")],
     policy: Annotated[str, typer.Option(help="The served policy that learns.")],
     repository: Annotated[
-        str, typer.Option(metavar="DIR|URI", help="Where the server reads policies; versions are published there.")
+        str, typer.Option(metavar="DIR|URI", help="The server's repository; versions are published there.")
     ],
     recordings: Annotated[list[Path], typer.Option(help="Folder in which a server records; one for each server.")],
-    out: Annotated[Path, typer.Option(help="The run's folder; the same command goes on with what is in it.")],
-    server: Annotated[str, typer.Option(help="The server.", envvar="RLSERVO_URL")] = LOCAL,
-    alias: Annotated[str, typer.Option(help="The alias that leads to the newest version.")] = "learning",
+    out: Annotated[Path, typer.Option(help="The run's folder; the same command resumes from it.")],
+    server: Annotated[str, typer.Option(help="URL of the server.", envvar="RLSERVO_URL")] = LOCAL,
+    alias: Annotated[str, typer.Option(help="Alias of the newest version.")] = "learning",
     every: Annotated[int, typer.Option(min=1, help="Updates between two versions.")] = 5,
     batch_size: Annotated[
-        int | None, typer.Option(min=1, help="Steps of whole episodes in an update; else the checkpoint's.")
+        int | None, typer.Option(min=1, help="Steps of whole episodes per update; the checkpoint's by default.")
     ] = None,
     max_age: Annotated[
-        int, typer.Option(min=0, help="Versions that may have come after the one that acted; older ones are dropped.")
+        int, typer.Option(min=0, help="Versions by which the one that acted may be behind; older episodes are dropped.")
     ] = 1,
     reward: Annotated[
         Path | None,
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="Python file with reward(obs, action, next_obs), in place of the clients'.",
+            help="Python file with reward(obs, action, next_obs), instead of the clients' rewards.",
         ),
     ] = None,
     versions: Annotated[
-        int | None, typer.Option(min=1, help="Stop after so many new versions; by default at Ctrl-C.")
+        int | None, typer.Option(min=1, help="Stop after this many new versions; at Ctrl-C by default.")
     ] = None,
-    app_dir: Annotated[Path, typer.Option(help="Folder with your own classes that the checkpoint names.")] = Path(),
+    app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     key_file: KeyFile = None,
 ) -> None:
     """Train a served policy on what robots do with it.

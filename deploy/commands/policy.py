@@ -1,4 +1,4 @@
-"""The commands `rlservo policy ...`: what is served, by a server or by the repository itself."""
+"""The commands `rlservo policy ...`: served versions, changed on a server or in a repository."""
 
 from __future__ import annotations
 

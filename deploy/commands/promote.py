@@ -80,7 +80,7 @@ def promote(
 
     for text, pattern, what in ((name, NAME_PATTERN, "policy name"), (version, VERSION_PATTERN, "version")):
         if re.fullmatch(pattern, text) is None:  # both become part of a file's name
-            raise UsageError(f"{text[:80]!r} is no {what}")
+            raise UsageError(f"{text[:80]!r} is not a {what}")
     limits = Limits(
         error_rate=_number("--max-error-rate", max_error_rate, PERCENT, 1.0),
         p99_s=_number("--max-p99", max_p99, SECONDS, 1.0),
@@ -108,7 +108,7 @@ def promote(
             outcome = Promotion(connect, terms, opened, every_s=every, say=terminal.note).run()
         except UsageError:
             raise
-        except RlservoError as error:  # nothing has begun, and 1 would say that it was rolled back
+        except RlservoError as error:  # nothing has begun, and 1 would mean that it was rolled back
             raise UsageError(error.message) from None
         except (SystemExit, KeyboardInterrupt) as ended:
             terminal.note(f"stopped by a signal: the canary keeps running; the same command continues ({file})")

@@ -26,7 +26,7 @@ def publish(
 ) -> None:
     """Publish a bundle for `rlservo serve URI`. A published version never changes.
 
-    The bundle is proven first. Its files are written before its line in the index, without which nobody sees the
+    The bundle is proven first. Its files are written before its line in the index, without which no server sees the
     version; one that is there is never overwritten. Credentials come from the environment (AWS_...).
 
     Example: `rlservo publish policies/ur5 s3://bucket/policies`
@@ -45,7 +45,7 @@ def publish(
                 from rlservo.export.renumber_bundle import renumber
 
                 chosen = renumber(chosen, str(version), Path(folder))
-        Policy.load(chosen.path).close()  # what no server would load is not published
+        Policy.load(chosen.path).close()  # a bundle that no server would load is not published
         place = publish_bundle(chosen, uri, progress=terminal.note)
     contract = chosen.contract
     if as_json:

@@ -41,7 +41,8 @@ Seed = Annotated[
 Limit = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="NAME=VALUE", help="Real arm: a limit (docs/how-to/ur-arm.md), speed_scale=0.1 say; repeat it."
+        metavar="NAME=VALUE",
+        help="Real arm: a limit such as speed_scale=0.1 (docs/how-to/ur-arm.md); repeat it for more.",
     ),
 ]
 
@@ -138,7 +139,7 @@ def server_manager(
     clock: Clock = "fast",
     max_servers: Annotated[int, typer.Option(min=1, help="Most robot servers that may run at once.")] = 100,
     orphan_timeout: Annotated[
-        float, typer.Option(min=0.0, help="Seconds without a client after which a robot server ends; 0: never.")
+        float, typer.Option(min=0.0, help="Seconds without a client after which a robot server exits; 0: never.")
     ] = 120.0,
 ) -> None:
     """Start robot servers for robo-gym's Sim environments. It stands in for the ROS server manager, until Ctrl-C.
@@ -165,7 +166,7 @@ def server_manager(
 
 
 def robot_latency(
-    robot: Annotated[str, typer.Argument(metavar="rtde://HOST", help="The arm.")],
+    robot: Annotated[str, typer.Argument(metavar="rtde://HOST", help="Address of the arm.")],
     ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
@@ -222,7 +223,7 @@ def ur_controller(
         str, typer.Option(help="Address to listen on: ports 29999 and 30001 to 30004, which clients do not choose.")
     ] = "127.0.0.1",
     latency_ms: Annotated[float, typer.Option(min=0.0, help="Delay of the link, each way.")] = 0.0,
-    jitter_ms: Annotated[float, typer.Option(min=0.0, help="Up to so much more.")] = 0.0,
+    jitter_ms: Annotated[float, typer.Option(min=0.0, help="Largest additional delay (jitter).")] = 0.0,
     drop: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of RTDE data packages that are lost.")] = 0.0,
 ) -> None:
     """Be the controller of a simulated UR arm until Ctrl-C. Lines on standard input stop the arm or cut the link.

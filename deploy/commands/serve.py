@@ -42,7 +42,9 @@ CanaryOption = Annotated[
 ]
 ShadowOption = Annotated[
     list[str] | None,
-    typer.Option("--shadow", metavar="NAME=VERSION", help="Version that is computed only to compare its actions."),
+    typer.Option(
+        "--shadow", metavar="NAME=VERSION", help="Version that runs in parallel, only to compare its actions."
+    ),
 ]
 
 
@@ -54,7 +56,7 @@ def serve(
         ),
     ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 is any free one.")] = 8000,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")] = 8000,
     grpc_port: Annotated[
         int | None,
         typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC on this port."),
@@ -64,7 +66,7 @@ def serve(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Policy of a WebSocket at '/', where openpi's clients connect; if there is one policy, that one.",
+            help="Policy for WebSockets at '/', where openpi's clients connect; the only policy by default.",
         ),
     ] = None,
     record: Annotated[
@@ -177,7 +179,7 @@ def _parse_yaml(text: str) -> Any:
     try:
         import yaml
     except ModuleNotFoundError:
-        raise UsageError("reading YAML needs the Python package 'pyyaml'; a .json file needs nothing") from None
+        raise UsageError("reading YAML needs the Python package 'pyyaml'; a .json file needs no package") from None
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:

@@ -22,7 +22,7 @@ from rlservo.export.contract.extras import needs_extra
 if TYPE_CHECKING:
     from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable
 
-EPISODES = 100  # of each row, if the caller does not say
+EPISODES = 100  # of each row by default
 WIDTH = 140  # [characters], of the table at least: narrower its figures fall apart
 
 
@@ -56,7 +56,7 @@ def verify(
     compiled: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of `rlservo compile`: drive --env with it too, on the same seeds, to the same endings."
+            help="Folder of `rlservo compile`: drive --env with it as well; the same seeds must end the same."
         ),
     ] = None,
     write: Annotated[
@@ -75,9 +75,9 @@ def verify(
     `rlservo verify policies/ur5 --compiled build --env rlservo/EndEffectorPositioningURSim-v0`
     """
     if not disturb and (disturbances or plot or write):
-        raise UsageError("disturbances, --plot and --write go with --disturb")
+        raise UsageError("disturbances, --plot and --write need --disturb")
     if env_arg and not disturb and compiled is None:
-        raise UsageError("--env-arg goes with --disturb and --compiled")
+        raise UsageError("--env-arg needs --disturb or --compiled")
     env = env and plain_id(env)
     if checkpoint is None and not disturb and compiled is None:
         raise UsageError("give --checkpoint to compare the bundle with, or --env with --disturb or --compiled")
@@ -144,7 +144,7 @@ def _verify_against(
 def _verify_compiled(
     compiled: Path, bundle: Path, env_id: str | None, episodes: int, seed: int, env_arg: list[str], as_json: bool
 ) -> dict[str, Any]:
-    """Drive the environment with the bundle and with its C. Raises ParityError where an episode ends otherwise."""
+    """Drive the environment with the bundle and with its C. Raises ParityError if an episode ends differently."""
     if env_id is None:
         raise UsageError("--compiled needs --env: the environment to drive")
     with needs_extra("sim", "gymnasium"):
@@ -169,7 +169,8 @@ def _verify_compiled(
     for a, b in pairs:
         if (a.final_status, a.steps) != (b.final_status, b.steps):
             raise ParityError(
-                f"episode {a.index} (seed {a.seed}) ends otherwise: with the bundle '{a.final_status}' after {a.steps}"
+                f"episode {a.index} (seed {a.seed}) ends differently: with the bundle '{a.final_status}' after "
+                f"{a.steps}"
                 f" steps, with its C '{b.final_status}' after {b.steps}"
             )
     apart = max(abs(a.episode_return - b.episode_return) for a, b in pairs)
@@ -193,7 +194,7 @@ def _measure(
     plot: Path | None,
     write: bool,
 ) -> DisturbanceTable:
-    """Measure a bundle under disturbances; draw and keep the table where asked for.
+    """Measure a bundle under disturbances; draw and store the table if requested.
 
     The environment is made with the `env_config` the policy was trained with, without the disturbances it was trained
     under, and with `env_arguments`. Raises UsageError for a disturbance that does not exist or cannot be had.

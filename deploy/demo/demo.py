@@ -260,7 +260,7 @@ def _stop(server: subprocess.Popen[bytes]) -> None:
 
 
 def _table(results: Mapping[str, Sequence[RobotRun]]) -> Table:
-    table = Table(title="Every action asked of a server, random targets, means over the episodes")
+    table = Table(title="Every action from a server, random targets, means over the episodes")
     for column in ("robot", "engine"):
         table.add_column(column, no_wrap=True)
     for column in ("at the target", "return", "time", "answer p50", "answer p99", "later than 100 ms"):

@@ -76,7 +76,7 @@ def draw_picture(file: Path, runs: list[RobotRun]) -> Path:
         for column, frame in enumerate(run.frames):
             axes = figure.add_subplot(grid[row, column])
             height = frame.shape[0]
-            axes.imshow(frame[height // 8 : -height // 8])  # sky above and floor below say little
+            axes.imshow(frame[height // 8 : -height // 8])  # without the sky above and the floor below
             axes.set_axis_off()
             axes.set_title(f"{run.robot.title}, {('start', 'midway', 'end')[column]}", fontsize=10)
         _draw_curves(figure.add_subplot(grid[row, -1]), run)

@@ -7,7 +7,7 @@ policy = rlservo.Policy.load("policies/ur5")
 action = policy.act(obs)
 ```
 
-This is the package `rlservo` itself (pyproject.toml maps it here). It imports nothing until a name is asked for.
+This is the package `rlservo` itself (pyproject.toml maps it here). It imports nothing until a name is used.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ _EXTRAS = {
 if not TYPE_CHECKING:  # a type checker would take it for a promise of every name
 
     def __getattr__(name: str) -> object:
-        """Import what `name` is when it is first asked for, and keep it."""
+        """Import the object `name` on first use, and keep it."""
         if name == "__version__":
             value = _installed_version()
         elif name in _MODULES:

@@ -42,7 +42,7 @@ class LaserScanners:
         ]
 
     def measure(self, rng: np.random.Generator) -> None:
-        """Cast all beams from where the robot is now."""
+        """Cast all beams from the robot's present pose."""
         x, y, yaw = self._data.qpos.tolist()
         cos, sin = math.cos(yaw), math.sin(yaw)
         turn = self._robot_to_map

@@ -28,7 +28,7 @@ from rlservo.envs.mir100.worlds import CUBE_SIZE, WALL_HEIGHT, World
 TIMESTEP = 0.01  # [s]
 BEAM_GROUP = 1  # the geom group of what the lasers can see
 
-# How fast the wheels' speed controllers work: a velocity error decays with this time constant.
+# Time constant with which the wheels' speed controllers reduce a velocity error.
 DRIVE_TIME_CONSTANT = 0.005  # [s], half a physics step: the shortest that cannot oscillate at the force limit
 GRIP_TIME_CONSTANT = 0.001  # [s], sideways: a corner at full speed slides by 1.5 mm/s
 

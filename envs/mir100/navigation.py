@@ -51,9 +51,9 @@ class Mir100Navigation(RenderedEnv):
     IS_PLANAR = True
     RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("start_pose", "target_pose")
     WORLD: ClassVar[str]
-    LASER_COUNT: ClassVar[int]  # how many of the readings are observed, evenly picked
+    LASER_COUNT: ClassVar[int]  # number of observed readings, evenly picked
     SUCCESS_REWARD: ClassVar[float]
-    VIEW: ClassVar[dict[str, Any]]  # where the camera stands
+    VIEW: ClassVar[dict[str, Any]]  # the camera's pose
 
     def __init__(
         self,
@@ -166,7 +166,7 @@ class Mir100Navigation(RenderedEnv):
     # -- for disturbances
 
     def set_base_offset(self, offset: tuple[float, float]) -> None:
-        """Tell the target wrong by `offset` (x, y) [m] on the map: the localisation is off."""
+        """Report a target that is wrong by `offset` (x, y) [m] on the map: the localisation is off."""
         self._base_offset = offset
 
     def sensor_errors(self) -> dict[str, SensorError]:
@@ -187,7 +187,7 @@ class Mir100Navigation(RenderedEnv):
         return np.array([x, y, 0.0])
 
     def target_position(self) -> Vector:
-        """Return where the target is on the map [m] (3,)."""
+        """Return the target's position on the map [m] (3,)."""
         x, y, _ = self.simulation.target
         return np.array([x, y, 0.0])
 
@@ -198,7 +198,7 @@ class Mir100Navigation(RenderedEnv):
         self._previous_distance = None
 
     def obstacle_positions(self) -> Vector:
-        """Return where the cubes are on the map [m] (n, 3)."""
+        """Return the cubes' positions on the map [m] (n, 3)."""
         return np.array([(x, y, 0.0) for x, y, _ in self.simulation.cubes]).reshape(-1, 3)
 
     def move_obstacle(self, index: int, position: ArrayLike) -> None:
@@ -212,7 +212,7 @@ class Mir100Navigation(RenderedEnv):
         return self.simulation.beams(self._shown_readings)
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
-        """Return the options of an episode that starts as asked for, the target where it is with `keep_target`."""
+        """Return the options of an episode with the requested start; `keep_target` leaves the target in place."""
         options: dict[str, Any] = {"target_pose": self.simulation.target} if keep_target else {}
         return {**options, "start_pose": self.simulation.pose} if start == "here" else options
 
@@ -222,9 +222,9 @@ class Mir100Navigation(RenderedEnv):
         return {"start_pose": (x, y, self.simulation.pose[2])}
 
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
-        """Put the robot where an episode's observations have it: round the target, which stands at the origin.
+        """Put the robot at the pose of an episode's observations, relative to the target, which is at the origin.
 
-        Where the robot looks is not observed: it is what it turned since the episode began, from its velocities.
+        The heading is not observed: it is integrated from the velocities since the episode began.
         Between the fixes of a target that is observed rarely, the way is summed up likewise.
         """
         x, y, yaw = _dead_reckoning(observations[: row + 1].astype(np.float64))
@@ -239,7 +239,7 @@ class Mir100Navigation(RenderedEnv):
 
     @abstractmethod
     def _random_start(self) -> Pose:
-        """Draw where the robot starts."""
+        """Draw the robot's start pose."""
 
     @abstractmethod
     def _random_target_position(self, start: Sequence[float]) -> tuple[float, float]:
@@ -267,7 +267,7 @@ class Mir100Navigation(RenderedEnv):
         return self._polar(target_x, target_y)
 
     def _told_target_polar(self) -> tuple[float, float]:
-        """Return the observation as the policy gets it, from where the robot believes to be."""
+        """Return the policy's observation, from the pose that the robot believes to have."""
         (target_x, target_y, _), (dx, dy) = self.simulation.target, self._base_offset
         return self._polar(target_x + dx, target_y + dy)
 

@@ -68,7 +68,7 @@ class NoObstacleNavigationMir100Sim(Mir100Navigation):
     there is no server to find; so is `rs_state_to_info`: robo-gym's MiR100 environments never put the server's state
     into info (it is `env.simulation.state()` here). `gui=True` is `render_mode="human"`. `laser_noise`, of our own,
     is the standard deviation of the lasers, which this task does not look at. Also of our own, for trainings that weigh
-    them otherwise: `failure_reward`, what an episode's last step gives instead of -200 where it failed, and
+    them differently: `failure_reward`, which a failed episode's last step gives instead of -200, and
     `step_reward` (0), which every other step gives in addition. Raises ValueError if one is not finite.
 
     ## Differences from robo-gym on Gazebo

@@ -22,7 +22,7 @@ SIDE = (2.1, 3.1)  # [m], |y| of start and target
 CUBE_COLUMNS = ((-2.4, -1.5), (-0.5, 0.5), (1.5, 2.4))  # [m], x of each cube
 # robo-gym's corners are those of a body centred at base_link.
 CORNERS = tuple((sx * LENGTH / 2, sy * WIDTH / 2) for sx in (1, -1) for sy in (1, -1))  # [m], in base_link
-REDRAWS = 1000  # of the cubes, while they stand in the way of a start pose that was asked for
+REDRAWS = 1000  # of the cubes, while they are in the way of a requested start pose
 
 
 class ObstacleAvoidanceMir100Sim(Mir100Navigation):
@@ -74,7 +74,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     robot starts within +-2 m in x and 2.1 to 3.1 m from the middle in y, on either side and in any direction; the
     target is drawn in the same way on the other side. The cubes (0.5 m) stand at x -2.4 .. -1.5, -0.5 .. 0.5 and
     1.5 .. 2.4 m, y -1 .. 1 m, turned at random. Cubes in the way of a `start_pose` are drawn again; a pose that fails
-    wherever they stand is refused with `InvalidResetError`. Of our own: `cubes` (three poses) says where they stand.
+    wherever they stand is refused with `InvalidResetError`. Of our own: `cubes` (three poses) places them.
     The room is 5.70 x 7.70 m inside, its middle at (-0.027, 0.014).
 
     ## Constructor
@@ -114,7 +114,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
         return [(draw(*column), draw(-1.0, 1.0), draw(-math.pi, math.pi)) for column in CUBE_COLUMNS]
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
-        """Return the options of an episode that starts as asked for; with the robot the cubes stay where they are."""
+        """Return the options of an episode with the requested start; if the robot stays, so do the cubes."""
         options = super().reset_options(start=start, keep_target=keep_target)
         return {**options, "cubes": self.simulation.cubes} if start == "here" else options
 

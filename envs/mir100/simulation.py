@@ -70,8 +70,8 @@ class Mir100Simulation:
         self._cubes = list(self.world.cubes)
         self._command = (0.0, 0.0)  # [m/s], [rad/s], the last one, within the velocity limits
         self._command_age = 0  # substeps
-        self._setpoint = (0.0, 0.0)  # [m/s], [rad/s], what the wheels are told: follows within the acceleration limits
-        self._velocity_factors = (1.0, 1.0)  # what the wheels make of a command, ahead and turning
+        self._setpoint = (0.0, 0.0)  # [m/s], [rad/s], the wheels' setpoint: follows within the acceleration limits
+        self._velocity_factors = (1.0, 1.0)  # the wheels' error in a command, ahead and turning
         self._body = self.model.body("base_link").id
         self._data_sheet = (
             float(self.model.body_mass[self._body]),
@@ -94,7 +94,7 @@ class Mir100Simulation:
         target_pose = self._target if target is None else _pose("target", target)
         cube_poses = self._cubes if cubes is None else [_pose(f"cube {i}", cube) for i, cube in enumerate(cubes)]
         if len(cube_poses) != len(self._cubes):
-            raise ValueError(f"{len(cube_poses)} cubes were given, world {self.world.name!r} has {len(self._cubes)}")
+            raise ValueError(f"{len(cube_poses)} cubes were given; world {self.world.name!r} has {len(self._cubes)}")
         self._target, self._cubes = target_pose, cube_poses
 
         data = self.data
@@ -133,7 +133,7 @@ class Mir100Simulation:
         floor [N] is uniform from 0 to size times the weight, for turning [Nm] at half the wheels' separation.
         """
         if not 0.0 <= size <= MAX_MODEL_ERROR:
-            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's figures")
+            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's values")
         model, (mass, inertia, gains, biases) = self.model, self._data_sheet
         mass_factor, inertia_factor = rng.uniform(1.0 - size, 1.0 + size, 2).tolist()
         gain_factors = rng.uniform(1.0 - size, 1.0 + size, len(gains))
@@ -196,7 +196,7 @@ class Mir100Simulation:
             if data.ncon:
                 in_contact = True
         self._setpoint = (linear, angular)
-        # mj_step leaves poses and contacts of its start: bring them up to where the robot is now.
+        # mj_step leaves the poses and contacts of its start: update them to the present state.
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         self.in_collision = in_contact or data.ncon > 0

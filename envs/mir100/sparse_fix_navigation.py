@@ -18,7 +18,7 @@ class SparseFixNavigationMir100Sim(NoObstacleNavigationMir100Sim):
 
     The task is `rlservo/NoObstacleNavigationMir100Sim-v0`, as a robot has it whose localisation is slow: the
     odometry speaks every cycle, a beacon or marker gives a fix every `fix_interval` cycles. In
-    between a policy must remember the last fix and the velocities since, or it does not know where the target is.
+    between a policy must remember the last fix and the velocities since, to know the target's position.
 
     ## Observation: Box(4,), float32
 

@@ -29,7 +29,7 @@ class World:
 
     name: str
     walls: tuple[Wall, ...] = ()
-    cubes: tuple[Pose, ...] = ()  # where they are before anybody places them
+    cubes: tuple[Pose, ...] = ()  # their poses before they are placed
 
 
 def _room(name: str, centre: tuple[float, float], size: tuple[float, float], cubes: tuple[Pose, ...]) -> World:

@@ -1,8 +1,8 @@
 """Reads the roslaunch lines that robo-gym's environments send to a server manager.
 
 Arguments and their defaults: jr-robotics/robo-gym-robot-servers, ur_robot_server/launch/ur_robot_server.launch and
-mir100_robot_server/launch/sim_robot_server.launch. Whatever is not known is refused by name; what only concerns the
-windows of Gazebo and RViz is accepted and has no effect; what asks for something that is not simulated is refused.
+mir100_robot_server/launch/sim_robot_server.launch. Unknown arguments are refused by name; one that only concerns the
+windows of Gazebo and RViz is accepted and has no effect; one that asks for something that is not simulated is refused.
 """
 
 from __future__ import annotations

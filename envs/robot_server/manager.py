@@ -19,7 +19,7 @@ from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, arrives, b
 from rlservo.envs.robot_server.server_process import ServerProcess
 from rlservo.envs.robot_server.settings import Settings, URSettings
 
-MANAGER_PORTS = range(50100, 50200)  # where robo-gym's clients look for a manager, in this order
+MANAGER_PORTS = range(50100, 50200)  # robo-gym's clients look for a manager here, in this order
 MAX_SERVERS = 100
 ORPHAN_S = 120.0  # [s] without any connection, after which a robot server ends itself
 WATCH_INTERVAL_S = 0.2
@@ -118,7 +118,7 @@ class RobotServers:
         self.kill_all()
 
     def _start_off_the_managers_ports(self, settings: Settings) -> ServerProcess:
-        """Start a server, again where the system gave it a port on which clients look for a manager.
+        """Start a server; start it again if the system gave it a port on which clients look for a manager.
 
         Or one whose last client may still ask for its end: that would end the new server.
         """
@@ -142,7 +142,9 @@ class RobotServers:
                     self._dead_ports.add(port)
             for port, server in exits:
                 server.kill()  # collects the process and its pipes
-                log.warning("%s on port %d ended by itself: %s", _title(server.settings), port, _why(server.exit_code))
+                log.warning(
+                    "%s on port %d exited unexpectedly: %s", _title(server.settings), port, _why(server.exit_code)
+                )
 
 
 class ManagerService:
@@ -223,8 +225,8 @@ def _bind_first(server: grpc.Server, host: str, ports: range | tuple[int, ...]) 
             if len(ports) == 1:
                 raise
     raise PortInUseError(
-        f"every port from {ports[0]} to {ports[-1]} on {host} is taken, where robo-gym's clients look for a manager: "
-        f"end another manager, or give a port"
+        f"every port from {ports[0]} to {ports[-1]} on {host} is taken: stop another manager, or give a port "
+        "(robo-gym's clients look for a manager on these)"
     )
 
 

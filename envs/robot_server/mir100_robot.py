@@ -49,7 +49,7 @@ class Mir100Robot:
         if not (len(values) == STATE_LENGTH or ROBOT.stop <= len(values) <= CUBES.start):
             raise ValueError(
                 f"the state has {len(values)} elements: expected {STATE_LENGTH}, or {ROBOT.stop} to {CUBES.start} "
-                f"to leave the cubes where they are"
+                f"to leave the cubes in place"
             )
         cubes = None
         if self.simulation.world.cubes and len(values) == STATE_LENGTH:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-if TYPE_CHECKING:  # MuJoCo is imported where a robot is made
+if TYPE_CHECKING:  # MuJoCo is imported when a robot is made
     from rlservo.envs.rendering import Camera
 
 CLOCKS = ("fast", "real")
@@ -27,7 +27,7 @@ class Robot(Protocol):
 
     @property
     def is_real(self) -> bool:
-        """Whether its cycles last as long as they do, whatever the clock says."""
+        """Whether its cycles take real time with any clock."""
         ...
 
     @property
@@ -39,7 +39,7 @@ class Robot(Protocol):
         ...
 
     def state(self) -> RobotState:
-        """Return the state, as a list and, where the original has names, by names."""
+        """Return the state, as a list and, if the original has names, by names."""
         ...
 
     def set_state(self, target: RobotState) -> int:

@@ -1,7 +1,7 @@
 """Runs one robot server: makes the robot, binds a port, serves until it is stopped.
 
 `rlservo robot-server` runs it in the foreground. The server manager runs it as a process of its own
-(`python -m rlservo.envs.robot_server.server '<settings>'`), which says on standard output what port it has, and ends
+(`python -m rlservo.envs.robot_server.server '<settings>'`), which prints its port on standard output, and ends
 when its standard input does: nothing outlives the manager, whatever becomes of it.
 """
 
@@ -31,18 +31,18 @@ from rlservo.envs.robot_server.settings import Settings, URSettings, settings_fr
 THREADS = 8  # calls at a time; one of them moves the robot
 OPTIONS = [("grpc.so_reuseport", 0)]  # gRPC's default lets two servers share a port, and clients meet either
 WATCH_INTERVAL_S = 2.0
-READY = "ready on port "  # what a manager waits for on standard output
+READY = "ready on port "  # a manager waits for this on standard output
 FAILED = "failed: "  # or this, and the reason
 
 log = logging.getLogger("rlservo.robot_server")
 
 
 class CannotListenError(OSError):
-    """The address cannot be listened on; the message says why."""
+    """The server cannot listen on the address; the message gives the reason."""
 
 
 class PortInUseError(CannotListenError):
-    """The port asked for is taken."""
+    """The requested port is taken."""
 
 
 class RobotServer:
@@ -77,14 +77,14 @@ def make_robot(settings: Settings) -> Robot:
 def bind(server: grpc.Server, host: str, port: int) -> int:
     """Bind a gRPC server and return the port it has.
 
-    Raises PortInUseError when the port is taken, CannotListenError for everything else; both say what and why.
+    Raises PortInUseError when the port is taken, CannotListenError for everything else; both name the cause.
     """
     address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
     _probe(host, port, address)  # gRPC names no reason, and writes several lines to standard error
     try:
         return int(server.add_insecure_port(address))
     except RuntimeError as error:
-        _probe(host, port, address)  # what was missing may be missing still: a file descriptor, say
+        _probe(host, port, address)  # a resource may still be missing: a file descriptor, say
         if port:
             raise PortInUseError(f"cannot listen on {address}: the port is taken") from error
         raise CannotListenError(f"cannot listen on {address}: gRPC failed without a reason") from error
@@ -124,7 +124,7 @@ def stop_signals() -> queue.SimpleQueue[int]:
 def arrives(signals: queue.SimpleQueue[int], timeout_s: float | None = None) -> bool:
     """Wait for a signal, indefinitely without a time; return whether one has come.
 
-    A wait without an end is one of many seconds: what comes a moment before it begins, or to another thread, interrupts
+    An endless wait is split into long ones: a signal that comes just before it begins, or to another thread, interrupts
     nothing, and its handler would not run until something did.
     """
     while True:
@@ -152,7 +152,7 @@ def serve_robot(settings: Settings, *, on_ready: Callable[[int], None], orphan_s
                 alone_since = time.monotonic()
                 continue
             if orphan_s is not None and time.monotonic() - alone_since > orphan_s:
-                log.warning("no client for %g s: this server shuts down", orphan_s)
+                log.warning("no client for %g s: shutting down", orphan_s)
                 return
     finally:
         server.stop()
@@ -167,7 +167,7 @@ def main(argv: list[str]) -> None:
 
     def ready(port: int) -> None:
         _say(f"{READY}{port}")
-        # Nobody reads on: what a library prints from now on goes nowhere instead of into a full pipe.
+        # The pipe is no longer read: later prints of libraries are discarded instead of filling it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     try:

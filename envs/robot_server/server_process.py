@@ -71,7 +71,7 @@ class ServerProcess:
                     pipe.close()
 
     def _receive_port(self, deadline: float) -> int:
-        """Wait for the line that says which port, or why not."""
+        """Wait for the line with the port, or the reason of a failure."""
         assert self._process.stdout is not None
         pipe = self._process.stdout.fileno()
         output = b""

@@ -68,7 +68,7 @@ class URSettings(Common):
     action_cycle_rate: float = 25.0  # [Hz]
     max_velocity_scale_factor: float = 1.0
     world: str = "tabletop"
-    objects: tuple[str, ...] | None = None  # None: what the mode needs
+    objects: tuple[str, ...] | None = None  # None: as many as the mode needs
     robot: str = MUJOCO  # or rtde://HOST
     limits: dict[str, Any] = field(default_factory=dict)  # of a real arm, as envs/robots/limits.py has them
     confirm: bool = True  # ask at the terminal before a real arm moves to a pose of SetState

@@ -33,7 +33,7 @@ class StateReader:
     def __init__(self, address: str) -> None:
         """`address` is HOST:PORT; nothing is sent before the first `read`."""
         self.address = address
-        # A robot is no matter for the proxy of `http_proxy`, which gRPC would ask even for this machine.
+        # Without the proxy of `http_proxy`, which gRPC would use even for this machine.
         options = [("grpc.max_reconnect_backoff_ms", 1000), ("grpc.enable_http_proxy", 0)]
         self._channel = grpc.insecure_channel(address, options=options)
         self._call = self._channel.unary_unary(f"/{ROBOT_SERVER}/GetState")
@@ -67,7 +67,7 @@ def env_of(state: RobotState) -> str:
 
 
 def show_state(env: RenderedEnv, state: RobotState) -> None:
-    """Put everything where the state has it: to look at, not to act. Raises RobotServerError for another robot's."""
+    """Show the state: to look at, not to act. Raises RobotServerError for another robot's state."""
     if isinstance(env, URArmEnv) and f"{JOINTS[0]}_joint_position" in state.names:
         joints = np.array([state.names[f"{joint}_joint_position"] for joint in JOINTS])
         env.simulation.place(np.clip(joints, -LIMITS, LIMITS))

@@ -66,7 +66,7 @@ class URRobot:
         return RobotState(values=list(names.values()), names=names)
 
     def set_state(self, target: RobotState) -> int:
-        """Put the arm where the state says, set the objects going, and let 20 cycles pass."""
+        """Put the arm at the state's pose, start the objects' motions, and let 20 cycles pass."""
         joints = self._target_joints(target)
         floats = {**self._float_params, **target.float_params}
         strings = {**self._string_params, **target.string_params}
@@ -78,13 +78,13 @@ class URRobot:
         self._float_params, self._string_params = floats, strings
         if self.simulation.place(joints) and self.is_real:
             links = " and ".join(self.simulation.contacts()[0])
-            raise ValueError(f"a real arm is not sent where {links} would touch")
+            raise ValueError(f"a real arm is not moved to a pose in which {links} would touch")
         self.simulation.move_objects(paths)
         self.simulation.settle()
         return SETTLE_CYCLES
 
     def act(self, action: Sequence[float]) -> None:
-        """Send the arm towards six joint positions, or by six offsets from where it is [rad], for one cycle."""
+        """Send the arm towards six joint positions, or by six offsets from its own [rad], for one cycle."""
         if len(action) != 6:
             raise ValueError(f"the action has {len(action)} elements, expected 6: {', '.join(ROS_JOINTS)} [rad]")
         for joint, value in zip(ROS_JOINTS, action, strict=True):
@@ -99,7 +99,7 @@ class URRobot:
         self.simulation.advance()
 
     def idle(self, cycles: int) -> None:
-        """Stop the arm where it is and let cycles pass."""
+        """Stop the arm in place and let cycles pass."""
         self.simulation.hold()
         for _ in range(cycles):
             self.simulation.advance()
@@ -122,7 +122,7 @@ class URRobot:
             joints = np.array([by_name[name] for name in names], dtype=np.float64)
         else:
             missing = ", ".join(name for name in names if name not in target.names)
-            raise ValueError(f"state_dict lacks {missing}, and state is empty: expected where to put the arm")
+            raise ValueError(f"state_dict lacks {missing}, and state is empty: expected the arm's joint positions")
         for joint, position, limit in zip(JOINTS, joints.tolist(), POSITION_LIMITS, strict=True):
             if not abs(position) <= limit + ROUNDING:
                 raise ValueError(f"the position of {joint} is {position:g} rad: expected within +-{limit:g} rad")

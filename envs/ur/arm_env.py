@@ -50,10 +50,10 @@ class URArmEnv(RenderedEnv):
     START_JOINTS: ClassVar[tuple[float, ...]]  # [rad]
     MAX_STEPS: ClassVar[int]
     RESET_OPTIONS: ClassVar[tuple[str, ...]]
-    RS_MODE: ClassVar[str]  # what `info["rs_state"]` holds
+    RS_MODE: ClassVar[str]  # content of `info["rs_state"]`
     OBJECTS: ClassVar[tuple[str, ...]]
     TABLE: ClassVar[bool]
-    ACTION_ELEMENT: ClassVar[tuple[str, str]]  # what follows the joint's name, and its unit
+    ACTION_ELEMENT: ClassVar[tuple[str, str]]  # suffix of the joint's name, and unit
     TIME_LIMIT_STATUS: ClassVar[str] = "success"  # the final status of an episode that lasts MAX_STEPS
     MAX_VELOCITY_SCALE: ClassVar[float] = 0.2
     RATE_HZ: ClassVar[float] = 20.0
@@ -81,7 +81,7 @@ class URArmEnv(RenderedEnv):
         lower_bound_port: int | None = None,
         upper_bound_port: int | None = None,
     ) -> None:
-        """The tasks' data sheets say what each argument means; None takes the task's own value."""
+        """The arguments are described in the tasks' docstrings; None takes the task's own value."""
         del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
         fixed = np.array((fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3))
         scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
@@ -191,7 +191,7 @@ class URArmEnv(RenderedEnv):
             self._camera = Camera(simulation.model, simulation.data, **VIEW)
 
     def set_base_offset(self, offset: tuple[float, float]) -> None:
-        """Tell positions of objects wrong by `offset` (x, y) [m]: the base stands elsewhere than it was measured."""
+        """Report positions of objects that are wrong by `offset` (x, y) [m]: the base is not where it was measured."""
         self._base_offset = np.array([*offset, 0.0])
 
     @property
@@ -261,7 +261,7 @@ class URArmEnv(RenderedEnv):
         return [element(f"{joint}_{name}", unit) for joint, is_fixed in zip(JOINTS, fixed, strict=True) if not is_fixed]
 
     def _place_arm(self, options: Mapping[str, Any]) -> Vector:
-        """Put the arm where the options say and return that."""
+        """Put the arm at the options' start and return it."""
         values = options.get("joint_positions")
         return self._place_arm_at(np.array(self.START_JOINTS) if values is None else self._check_joints(values))
 

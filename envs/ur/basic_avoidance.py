@@ -65,7 +65,7 @@ class BasicAvoidanceURSim(URArmEnv):
     | collision | a link touches the ball, the table, the ground or the arm itself | terminated |
     | success | 1000 steps without a collision | truncated |
 
-    The last step's info also holds `is_success` and `target_coord`, where the ball is.
+    The last step's info also holds `is_success` and `target_coord`, the ball's position.
 
     ## Reset options
 
@@ -86,7 +86,7 @@ class BasicAvoidanceURSim(URArmEnv):
     ## Differences from robo-gym on Gazebo
 
     robo-gym 2.0.1's own class cannot be reset or stepped with any server (its `reset` and `step` call their parents
-    with the signatures of version 1); what it means to do is done here. The time limit truncates (robo-gym says done).
+    with the signatures of version 1); its intent is implemented here. The time limit truncates (robo-gym says done).
     All randomness comes from the environment's own seed. Resets are immediate, and a colliding start is refused.
     """
 
@@ -127,15 +127,15 @@ class BasicAvoidanceURSim(URArmEnv):
     # -- for viewers
 
     def target_position(self) -> Vector:
-        """Return where the ball is in MuJoCo's world [m] (3,)."""
+        """Return the ball's position in MuJoCo's world [m] (3,)."""
         return self.simulation.object_position(0) + BASE
 
     def move_target(self, position: ArrayLike) -> None:
-        """Put the ball somewhere else in MuJoCo's world [m] (3,), where it stays for the rest of the episode."""
+        """Put the ball at a position in MuJoCo's world [m] (3,), where it stays for the rest of the episode."""
         self.simulation.place_object(0, as_vector("position", position, 3) - BASE)
 
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
-        """Put arm and ball where an observation has them."""
+        """Put arm and ball at the poses of an observation."""
         sim = self.simulation
         sim.place(observations[row, 3:9] * LIMITS)
         r, theta, phi = observations[row, 0:3].tolist()
@@ -161,7 +161,7 @@ class BasicAvoidanceURSim(URArmEnv):
             }
             if self._start_object("triangle_wave", wave, refuse=is_given):
                 return
-        raise InvalidResetError(f"{REDRAWS} random motions of the ball all hit the arm at the given joint positions")
+        raise InvalidResetError(f"all {REDRAWS} random motions of the ball hit the arm at the given joint positions")
 
     def _start_object(self, function: str, parameters: dict[str, float], *, refuse: bool = True) -> bool:
         sim = self.simulation

@@ -82,7 +82,7 @@ class EmptyEnvironmentURSim(URArmEnv):
         return -high, high
 
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
-        """Put the arm where an observation has it."""
+        """Put the arm at the pose of an observation."""
         self.simulation.place(observations[row, :6] * LIMITS)
 
     def _begin(self, options: Mapping[str, Any]) -> None:

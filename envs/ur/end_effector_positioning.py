@@ -156,12 +156,12 @@ class EndEffectorPositioningURSim(URArmEnv):
             x, y, z = self.simulation.tool_position.tolist()
             if math.hypot(x, y) < CORNER_RADIUS or z < CORNER_HEIGHT:
                 return {"joint_positions": joints.tolist(), "randomize_start": False}
-        raise InvalidResetError(f"{REDRAWS} random poses were none in a corner")
+        raise InvalidResetError(f"none of {REDRAWS} random poses is in a corner")
 
     # -- for viewers
 
     def target_position(self) -> Vector:
-        """Return where the target is in MuJoCo's world [m] (3,)."""
+        """Return the target's position in MuJoCo's world [m] (3,)."""
         return self._target + BASE
 
     def move_target(self, position: ArrayLike) -> None:
@@ -170,7 +170,7 @@ class EndEffectorPositioningURSim(URArmEnv):
         self.simulation.place_object(0, self._target)
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
-        """Return the options of an episode that starts as asked for, the target where it is with `keep_target`."""
+        """Return the options of an episode with the requested start; `keep_target` leaves the target in place."""
         options: dict[str, Any] = {"ee_target_pose": [*self._target.tolist(), 0.0, 0.0, 0.0]} if keep_target else {}
         if start == "here":
             joints = np.clip(self.simulation.joint_positions, -LIMITS, LIMITS)
@@ -184,7 +184,7 @@ class EndEffectorPositioningURSim(URArmEnv):
         return {**super().start_at(position), "randomize_start": False}
 
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
-        """Put arm and target where an observation has them."""
+        """Put arm and target at the poses of an observation."""
         self.simulation.place(observations[row, 3:9] * LIMITS)
         self.move_target(observations[row, 15:18] + BASE)
 
@@ -205,7 +205,7 @@ class EndEffectorPositioningURSim(URArmEnv):
             joints: Vector = np.clip(draw, -LIMITS, LIMITS)
             if not self.simulation.place(joints):
                 return joints
-        raise InvalidResetError(f"{REDRAWS} random starts around the given joint positions all collide")
+        raise InvalidResetError(f"all {REDRAWS} random starts around the given joint positions collide")
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         self._previous_action = np.zeros(6)
@@ -251,7 +251,7 @@ class EndEffectorPositioningURSim(URArmEnv):
     def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
         self._previous_action = command  # after the observation: robo-gym's order, see the data sheet
         distance = float(observation[0])
-        if self._base_offset.any():  # what is told is not where it is
+        if self._base_offset.any():  # the reported position is wrong
             distance = math.dist(self._target, self.simulation.tool_position)
         if self.simulation.in_collision:
             return -1.0, "collision"
@@ -267,7 +267,7 @@ class EndEffectorPositioningURSim(URArmEnv):
 
 
 class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
-    """The same task on a real arm: `robot` is 'rtde://192.168.0.2', say.
+    """The same task on a real arm: `robot` is for example 'rtde://192.168.0.2'.
 
     Observations, actions, rewards and endings are the simulated environment's, computed from the measured joints; a
     robot that stops ends the episode with what stopped it as `final_status` (protective_stop, emergency_stop,
@@ -280,5 +280,5 @@ class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
 
     def __init__(self, *, robot: str = "", **arguments: Any) -> None:
         if not robot:
-            raise ValueError("robot is missing: expected the arm's address, say robot=rtde://192.168.0.2")
+            raise ValueError("robot is missing: expected the arm's address, such as robot=rtde://192.168.0.2")
         super().__init__(robot=robot, **arguments)

@@ -128,7 +128,7 @@ def _document(arm: URParameters, objects: list[ObjectModel], table: bool) -> str
     </body>
   </worldbody>
   <contact>
-    <!-- MuJoCo leaves out parent and child, but not where the parent is fixed to the world. -->
+    <!-- MuJoCo leaves out parent and child, except if the parent is fixed to the world. -->
     <exclude body1="base" body2="shoulder"/>
     <exclude body1="base" body2="world"/>
   </contact>
@@ -155,7 +155,7 @@ def _objects(objects: list[ObjectModel]) -> str:
         size = " ".join([str(model.half_size)] * (1 if model.shape == "sphere" else 3))
         # Seen by the links' contype, and by nothing else; the arm's base does not move and so never counts.
         touch = f'contype="0" conaffinity="1" {OBJECT_SOFTNESS}' if model.collides else 'class="seen"'
-        # Out of the way until it is placed, where the original parks its objects.
+        # Out of the way until it is placed, as in the original.
         lines.append(f'<body name="object_{index}" mocap="true" pos="{index} 0 {PARKED_HEIGHT + BASE_HEIGHT}">')
         lines.append(f'<geom name="object_{index}" {touch} type="{model.shape}" size="{size}" rgba="{model.rgb} 1"/>')
         if model.halo:

@@ -16,7 +16,7 @@ UPDATE_RATE_HZ = 100
 MAX_POINTS = 1_000_000  # of one path: nearly three hours
 REDRAWS = 10_000  # of a spline that crosses the arm's base; roughly one in five does not
 
-# What the splines of `3d_spline_ur5_workspace` keep away from [m].
+# Distances that the splines of `3d_spline_ur5_workspace` keep [m].
 BASE_CYLINDER, BASE_SPHERE = 0.2, 0.35
 FIRST_POINT = (0.5, 1.0)  # the range of |x| and |y| of their first point
 

@@ -1,4 +1,4 @@
-"""The modes of robo-gym's robot server for the arm: what a state holds, and where.
+"""Modes of robo-gym's robot server for the arm: layout of the state.
 
 Source: jr-robotics/robo-gym-robot-servers, ur_robot_server.
 """

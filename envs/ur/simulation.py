@@ -31,9 +31,9 @@ VIEW: dict[str, Any] = {"lookat": (0.0, 0.05, 0.42), "distance": 2.3, "azimuth":
 # Of `joints_towards`.
 REACH_STEPS = 60
 REACH_STEP = 0.05  # [m], of tool0 at once
-REACH_DAMPING = 0.05  # [m], which keeps the joints calm where the arm is stretched
+REACH_DAMPING = 0.05  # [m], keeps the joints calm when the arm is stretched
 
-LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")  # what moves
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")  # the moving links
 MAX_PAYLOAD = 20.0  # [kg], more than the largest arm carries (ur16e: 16 kg)
 
 Vector = NDArray[np.float64]
@@ -50,7 +50,7 @@ class _DataSheet(NamedTuple):
 
 
 class URSimulation:
-    """One arm on its table, at 200 Hz physics, or the next higher rate of which a control cycle is a whole number.
+    """One arm on its table, at 200 Hz physics, or the next higher rate with a whole number of steps per control cycle.
 
     `max_velocity_scale` multiplies the arm's joint velocity limits, as the robot server's parameter of that name.
     `objects` are names of `OBJECT_MODELS`. Without `table` the arm stands 0.1 m above bare ground.
@@ -135,7 +135,7 @@ class URSimulation:
         return self.in_collision
 
     def place_object(self, index: int, position: ArrayLike) -> None:
-        """Put an object at `position` [m] (3,) in base_link, where it stays."""
+        """Put an object at `position` [m] (3,) in base_link and leave it there."""
         self.move_objects({index: np.asarray(position, dtype=np.float64)[None, :]})
 
     def move_objects(self, paths: dict[int, Path]) -> None:
@@ -160,7 +160,7 @@ class URSimulation:
             self.advance()
 
     def set_payload(self, mass: float) -> None:
-        """Fasten a point mass [kg] to tool0 of which the arm's gravity compensation does not know; 0 takes it off."""
+        """Fasten a point mass [kg] to tool0, unknown to the arm's gravity compensation; 0 removes it."""
         if not 0.0 <= mass <= MAX_PAYLOAD:
             raise ValueError(f"the payload is {mass:g} kg: expected 0 to {MAX_PAYLOAD:g} kg")
         self.model.body_mass[self._payload] = mass
@@ -175,7 +175,7 @@ class URSimulation:
         for the gravity of the masses in the data sheet.
         """
         if not 0.0 <= size <= MAX_MODEL_ERROR:
-            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's figures")
+            raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's values")
         model, sheet = self.model, self._data_sheet
         masses, inertias = rng.uniform(1.0 - size, 1.0 + size, (2, len(LINKS)))
         gains = rng.uniform(1.0 - size, 1.0 + size, 6)
@@ -214,7 +214,7 @@ class URSimulation:
         np.divide(way, self._remaining * timestep, out=self._velocity)
 
     def hold(self) -> None:
-        """Stop where the arm is: the robot server does so when a cycle passes without a command."""
+        """Stop in place: the robot server does so when a cycle passes without a command."""
         self.data.act[:] = self.data.qpos
         self._velocity[:] = 0.0
         self._remaining = 0
@@ -291,7 +291,7 @@ class URSimulation:
     def joints_towards(self, position: ArrayLike) -> Vector:
         """Return joint positions [rad] (6,) that bring tool0 to a position in base_link [m] (3,), or near it.
 
-        Damped least squares from where the arm is, so that it keeps its posture; nothing moves.
+        Damped least squares from the arm's present posture, so that it is kept; nothing moves.
         """
         goal = np.asarray(position, dtype=np.float64)
         joints: Vector = self.joint_positions.copy()

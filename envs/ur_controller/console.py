@@ -20,7 +20,7 @@ def obey(server: ControllerServer, line: str) -> str:
     word, _, rest = line.strip().partition(" ")
     controller, link = server.controller, server.link
     plain: dict[str, Callable[[], object]] = {
-        "protective": lambda: controller.stop_protectively("asked for at the console"),
+        "protective": lambda: controller.stop_protectively("requested at the console"),
         "emergency": controller.stop_in_emergency,
         "unlock": lambda: "" if controller.unlock_protective_stop() else "not before 5 s have passed",
         "release": controller.recover_from_emergency_stop,
@@ -37,7 +37,7 @@ def obey(server: ControllerServer, line: str) -> str:
     try:
         value = float(rest) * scales[word]
     except (KeyError, ValueError):
-        return f"{line.strip()[:100]!r} is no command; help lists them"
+        return f"{line.strip()[:100]!r} is not a command; help lists them"
     if not 0.0 <= value <= (10.0 if word in ("latency", "jitter") else 1.0):
         return f"{word} {rest}: expected 0 to {'10000 ms' if word in ('latency', 'jitter') else '1'}"
     if word == "slider":

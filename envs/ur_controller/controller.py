@@ -175,7 +175,7 @@ class Controller:
             self._watchdog.fed_at_s = self.time_s
 
     def excuse(self, held_up_s: float) -> None:
-        """Leave time [s] for which the controller itself was held up, and that it makes good now, to no one's debit."""
+        """Discount time [s] for which the controller itself was held up and that it now catches up."""
         self.held_up_s += held_up_s
         if self._watchdog is not None:
             self._watchdog.fed_at_s += held_up_s

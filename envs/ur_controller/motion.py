@@ -12,7 +12,7 @@ Vector = NDArray[np.float64]
 
 
 class Motion(Protocol):
-    """What the setpoint does until it `is_done`."""
+    """The setpoint's motion until it `is_done`."""
 
     is_done: bool
 

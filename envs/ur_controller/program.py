@@ -27,7 +27,7 @@ _OFFSET = re.compile(r"reg_offset_int\s*=[^\n]*\n?\s*([0-9]+)")
 
 
 def control_program(controller: Controller, text: str) -> Iterator[None]:
-    """Return the running program; what is not ur_rtde's control script ends at once with a line in the log."""
+    """Return the running program; one that is not ur_rtde's control script ends at once with a line in the log."""
     if MARK not in text:
         log.warning("a program of %d characters is not ur_rtde's control script and is not run", len(text))
         return
@@ -43,7 +43,7 @@ class _ControlScript:
         self._async_progress = -1
 
     def run(self) -> Iterator[None]:
-        """Read the command register once a cycle until the script is told to stop."""
+        """Read the command register once a cycle until the stop command."""
         self._write_int(2, self._async_progress)
         self._write_int(0, READY)
         is_executing = False
@@ -124,7 +124,7 @@ class _ControlScript:
         self._write_doubles(self._arm.positions_before(self._int(1)))
 
     def protective_stop(self) -> None:
-        self._arm.stop_protectively("asked for by the program")
+        self._arm.stop_protectively("requested by the program")
 
     def set_watchdog(self) -> None:
         self._arm.set_watchdog(self._offset, self._double(0))

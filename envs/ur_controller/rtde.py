@@ -55,7 +55,7 @@ OUTPUTS: dict[str, Field] = {
         for kind, types in (("int", "INT32"), ("double", "DOUBLE"))
         for index in range(REGISTERS)
     },
-    # What the simulation has no quantity for.
+    # Quantities that are not simulated.
     **{
         name: _constant("VECTOR6D", SIX_ZEROS)
         for name in (
@@ -114,7 +114,7 @@ class RtdeSession:
         self._is_started = False
 
     def receive(self, data: bytes) -> bytes:
-        """Take a client's bytes and return the replies. Raises ValueError for what is no RTDE."""
+        """Take a client's bytes and return the replies. Raises ValueError if they are not RTDE."""
         self._buffer += data
         replies = b""
         while len(self._buffer) >= HEADER.size:
@@ -128,7 +128,7 @@ class RtdeSession:
         return replies
 
     def sample(self) -> bytes:
-        """Return the data package of this control cycle; nothing where the client is not due one."""
+        """Return the data package of this control cycle; nothing if the client is not due one."""
         if not self._is_started or self._controller.ticks % self._every:
             return b""
         values: list[Any] = []
@@ -188,7 +188,7 @@ class RtdeSession:
     def _take(self, payload: bytes) -> None:
         recipe = payload[0] - 1 if payload else -1
         if not 0 <= recipe < len(self._inputs):
-            raise ValueError(f"data for recipe {recipe + 1}, and there are {len(self._inputs)}")
+            raise ValueError(f"data for recipe {recipe + 1}, but there are {len(self._inputs)}")
         names, layout = self._inputs[recipe]
         if len(payload) - 1 != layout.size:
             raise ValueError(f"{len(payload) - 1} bytes for recipe {recipe + 1}: expected {layout.size}")

@@ -1,7 +1,8 @@
 """Ports of the simulated controller, its clock, and the faults of the link to it.
 
 One loop in one thread: sockets while a control cycle's time has not come, then the cycle. Time is the wall clock's.
-Where the machine holds the loop up, the cycles are made good at once, and the watchdog does not blame the client.
+If the machine delays the loop, the cycles are caught up at once, and the watchdog does not count the delay against the
+client.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ log = logging.getLogger("rlservo.ur_controller")
 
 
 class CannotListenError(OSError):
-    """A port of the controller cannot be listened on; the message says which and why."""
+    """The controller cannot listen on one of its ports; the message names it and the reason."""
 
 
 @dataclass
@@ -70,7 +71,7 @@ class ControllerServer:
         self._rng = np.random.default_rng(seed)
         self._in_use: dict[str, RtdeSession] = {}
         self._connections: dict[socket.socket, _Connection] = {}
-        self._waiting: list[tuple[float, int, Callable[[], None]]] = []  # what the link holds back, by due time
+        self._waiting: list[tuple[float, int, Callable[[], None]]] = []  # data that the link delays, by due time
         self._count = 0
         self._asked: list[Callable[[], object]] = []
         self._listeners: dict[socket.socket, int] = {}
@@ -156,7 +157,7 @@ class ControllerServer:
             try:
                 replies = connection.rtde.receive(data)
             except (ValueError, IndexError) as error:
-                log.warning("a client of RTDE is disconnected: %s", error)
+                log.warning("an RTDE client was disconnected: %s", error)
                 self._drop(connection)
                 return
             if replies:
@@ -174,7 +175,7 @@ class ControllerServer:
             text, connection.text = connection.text.decode(errors="replace"), b""
             self.controller.load_program(text)
         if len(connection.text) > LARGEST_PROGRAM:
-            log.warning("a client of port %d is disconnected: more than %d bytes", connection.port, LARGEST_PROGRAM)
+            log.warning("a client of port %d was disconnected: more than %d bytes", connection.port, LARGEST_PROGRAM)
             self._drop(connection)
 
     def _publish(self) -> None:
@@ -252,6 +253,6 @@ def _listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         is_taken = error.errno == errno.EADDRINUSE
-        reason = "the port is taken; another address, 127.0.0.2 say, has ports of its own" if is_taken else str(error)
+        reason = "the port is taken; another address such as 127.0.0.2 has ports of its own" if is_taken else str(error)
         raise CannotListenError(f"cannot listen on {host}:{port}: {reason}") from error
     return listener

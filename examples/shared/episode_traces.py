@@ -1,6 +1,6 @@
 """Write what environments and policy did during training, and read it again: one JSON line per piece of an episode.
 
-RLlib's own recorder (`config.output`, ray 2.60) needs cores for Ray Data beside the env runners', and without a
+RLlib's own recorder (`config.output`, ray 2.60) needs cores for Ray Data besides the env runners', and without a
 row limit writes every earlier sample again into every file. This is a callback instead. Files are named as RLlib's
 documentation shows them, `output-2026-02-23_12-02-03_worker-2_0.json`; a long episode has several lines, in order.
 """
@@ -22,7 +22,7 @@ MAX_BYTES = 64_000_000  # then the next file is begun
 
 @dataclass
 class Trace:
-    """An episode: one more observation than actions; `ended` is None while it was still going on."""
+    """An episode: one more observation than actions; `ended` is None for one cut off before its end."""
 
     episode: str
     observations: list[Any] = field(default_factory=list)
@@ -54,7 +54,7 @@ def trace_writer(folder: Path) -> Callable[..., None]:
 
 def _piece(episode: Any) -> dict[str, Any]:
     outputs = episode.extra_model_outputs
-    # What the environment was sent, where it is not what the network gave (scaled or clipped).
+    # The action sent to the environment, if it differs from the network's (scaled or clipped).
     actions = (
         episode.get_extra_model_outputs("actions_for_env") if "actions_for_env" in outputs else episode.get_actions()
     )

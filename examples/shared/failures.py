@@ -1,6 +1,6 @@
-"""Failures in RLlib's env runners: written beside the run, printed at once, and the end of a run that samples nothing.
+"""Failures in RLlib's env runners: written next to the run, printed at once, and the end of a run that samples nothing.
 
-Where a sample fails, RLlib (2.60) logs the error in the env runner's process, ends that process and starts another. The
+If a sample fails, RLlib (2.60) logs the error in the env runner's process, ends that process and starts another. The
 process that trains sees an iteration without a step; the user sees nothing, and is left with an untrained policy.
 """
 
@@ -30,7 +30,7 @@ MADE_AT_MOST = 100  # environments for one sample, where those that crash are ma
 PRINT_EVERY_S = 10.0  # while more of them fail
 BUILT_S = 60.0  # after an env runner failed to start
 EXCEPTION = re.compile(r"[\w.]+(Error|Exception|Exit): \S")  # a traceback's last line
-LOST = re.compile(r"\), taking actor \d+ out of service\.$")  # what RLlib writes behind one
+LOST = re.compile(r"\), taking actor \d+ out of service\.$")  # RLlib's suffix
 HEAD = "--- "  # begins the line that names a failure; its traceback follows
 
 
@@ -69,7 +69,7 @@ def watch(config: AlgorithmConfig, folder: Path) -> None:
 
 
 def metric(result: Mapping[str, Any], name: str) -> float:
-    """Return a number of a result by its path (`env_runners/num_episodes`), nested or flat; NaN where it is none."""
+    """Return a number of a result by its path (`env_runners/num_episodes`), nested or flat; NaN if there is none."""
     value: Any = result.get(name)
     if value is None:
         value = result
@@ -141,8 +141,8 @@ def in_a_line(error: object) -> str:
             error = error.__cause__
         return " ".join(f"{type(error).__name__}: {error}".split())
     lines = [line for line in str(error).splitlines() if line and not line.startswith((" ", "\t", "Traceback"))]
-    told = [line for line in lines if EXCEPTION.match(line)]  # RLlib raises some without words
-    return (told or lines or [type(error).__name__])[-1]
+    exceptions = [line for line in lines if EXCEPTION.match(line)]  # RLlib raises some without words
+    return (exceptions or lines or [type(error).__name__])[-1]
 
 
 def _write_errors(file: Path) -> None:
@@ -165,12 +165,12 @@ class _ErrorWriter(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         if record.exc_info and record.exc_info[1]:
             words, text = in_a_line(record.exc_info[1]), "".join(traceback.format_exception(record.exc_info[1]))
-        else:  # where an environment cannot be made in its process, RLlib logs that process's traceback, as a text
+        else:  # if an environment cannot be made in its process, RLlib logs that process's traceback, as a text
             text = LOST.sub("", record.getMessage())
             words = in_a_line(text)
             if not EXCEPTION.match(words):
                 return
-        if words == self._last:  # it is logged where it is caught, and where the process ends
+        if words == self._last:  # it is logged when it is caught and when the process ends
             return
         self._last = words
         place = f"{time.strftime('%Y-%m-%d %H.%M.%S')}, process {record.process} on {socket.gethostname()}"

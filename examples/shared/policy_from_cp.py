@@ -29,7 +29,7 @@ Act = Callable[[Any, bool], tuple[NDArray[Any], bool]]
 
 @dataclass
 class Count:
-    """How many actions there were, and how many the policy itself put outside the action space."""
+    """Number of actions, and of those that the policy itself put outside the action space."""
 
     actions: int = 0
     clipped: int = 0

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 
-# Ray 2.60 turns token authentication on once any local ray.init() has written a token; said here, it is always on.
+# Ray 2.60 turns token authentication on once any local ray.init() has written a token; set here, it is always on.
 os.environ.setdefault("RAY_AUTH_MODE", "token")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")

@@ -22,11 +22,11 @@ from ray.rllib.offline.offline_data import OfflineData
 from ray.rllib.utils import flatten_dict
 
 assert ray_settings
-AT_ONCE = 256  # episodes of which minibatches are drawn
+AT_ONCE = 256  # episodes from which minibatches are drawn
 
 
 class RecordedEpisodes(OfflineData):
-    """What RLlib's offline algorithms draw their minibatches from; `episodes` are to be given once it is built."""
+    """Source of minibatches for RLlib's offline algorithms; `episodes` are to be given once it is built."""
 
     def __init__(self, config: Any) -> None:  # not RLlib's own: that reads files
         self.config = config

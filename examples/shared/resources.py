@@ -1,7 +1,7 @@
 """Resources of a training run: refuse what cannot be had before anything starts, and name what is waited for.
 
-RLlib's processes are bundles of CPUs and GPUs, each of which must fit one machine. Ray waits for ever, and without a
-word, for those that fit nowhere (ray 2.60).
+RLlib's processes are bundles of CPUs and GPUs, each of which must fit one machine. Ray waits indefinitely, and without
+a word, for those that fit nowhere (ray 2.60).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rlservo import errors
 assert ray_settings
 Bundle = Mapping[str, float]  # resource -> amount, of one process
 SAID_AFTER_S, SAID_AGAIN_S, POLL_S = 10.0, 60.0, 1.0
-# Where Ray's autoscaler, its cluster launcher or KubeRay started a node: more may come.
+# Set if Ray's autoscaler, its cluster launcher or KubeRay started a node: more may come.
 NODE_GROUP = "ray.io/node-group"
 ROUNDING = 1e-6
 
@@ -58,7 +58,7 @@ def request_of(config: AlgorithmConfig) -> list[dict[str, float]]:
     try:
         factory = cast(Any, config.algo_class).default_resource_request(config.copy(copy_frozen=False))
     except (TypeError, ValueError) as error:
-        raise errors.UsageError(f"the resources asked for are none that RLlib understands: {error}") from error
+        raise errors.UsageError(f"RLlib does not understand the requested resources: {error}") from error
     bundles = [{name: float(amount) for name, amount in bundle.items() if amount} for bundle in factory.bundles]
     if factory.strategy == "STRICT_PACK":
         return [{name: _total(bundles, name) for bundle in bundles for name in bundle}]
@@ -117,12 +117,12 @@ def _fitting(request: Sequence[Bundle], room: Room, at_most: int) -> int:
 
 def _advice(request: Sequence[Bundle], room: Room, name: str, config: AlgorithmConfig | None) -> str:
     if config is None:
-        return "go on where there are as many, or start a new run"
+        return "resume on a machine that has as many, or start a new run"
     if name == "GPU":
         return "leave --num-gpus out to learn on the CPU"
     each: object = config.num_cpus_per_env_runner
     if not isinstance(each, int | float):
-        return "leave the values out that ask for as many"  # it is swept
+        return "leave out the values that ask for so many"  # it is swept
     rest = _total(request, name) - each * (config.num_env_runners or 0)
     if name != "CPU" or not each or rest > room.total(name) + ROUNDING:
         return "ask for fewer learners or evaluation runners, or for less in each process"
@@ -169,7 +169,7 @@ def _watch(done: threading.Event) -> None:
     printed_at: dict[str, float] = {}  # line -> when it was printed
     while not done.wait(POLL_S):
         try:
-            # A group's id ends with that of the job it belongs to; others' on the cluster are not ours to tell.
+            # A group's id ends with that of the job it belongs to; other jobs' are not ours to report.
             ours = {key: group for key, group in placement_group_table().items() if key.endswith(job)}
             pending = {key for key, group in ours.items() if group["state"] in ("PENDING", "RESCHEDULING")}
             now = time.monotonic()
@@ -179,7 +179,7 @@ def _watch(done: threading.Event) -> None:
                 continue
             runs = any(group["state"] == "CREATED" for group in ours.values())
             line = _waiting_line(list(ours[long[0]]["bundles"].values()))
-        except Exception:  # Ray is ending, or its head is away: whoever trains says so
+        except Exception:  # Ray is shutting down, or its head is unreachable: the training reports it
             continue
         if line not in printed_at or (not runs and now - printed_at[line] >= SAID_AGAIN_S):
             printed_at[line] = now

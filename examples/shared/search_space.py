@@ -1,7 +1,7 @@
 """Read hyper-parameters from a command line or a YAML file: `lr=1e-4,3e-4` and ranges, checked against an algorithm.
 
     lr: [0.0001, 0.0003]            # each of them, as --sweep lr=1e-4,3e-4
-    gamma: {uniform: [0.95, 0.999]}  # drawn anew for each of --num-samples
+    gamma: {uniform: [0.95, 0.999]}  # drawn for each of --num-samples
     entropy_coeff: {loguniform: [0.0001, 0.01]}
     minibatch_size: {choice: [64, 128, 256]}
     train_batch_size_per_learner: {randint: [1000, 4000]}
@@ -55,7 +55,7 @@ NEW_NAMES = {
 
 
 def parse_settings(pairs: Sequence[str], option: str) -> dict[str, list[Any]]:
-    """Return NAME=VALUE[,VALUE...] pairs as lists of YAML values (`1e-4` is a number, too).
+    """Return NAME=VALUE[,VALUE...] pairs as lists of YAML values (`1e-4` is also a number).
 
     Raises UsageError naming the pair that is none.
     """

@@ -30,7 +30,7 @@ SUPPORTED = ("PPO", "APPO", "IMPALA", "SAC")
 
 @dataclass(frozen=True)
 class Task:
-    """What one of the two scripts trains, and the settings that were found to work."""
+    """Task of one of the two scripts, with settings that were found to work."""
 
     env_id: str
     env_config: dict[str, Any]
@@ -79,9 +79,7 @@ def argument_parser(task: Task, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--num-envs-per-env-runner", type=int, default=8, help="simulators in each sampling process")
     parser.add_argument("--checkpoint-frequency", type=int, default=20, help="iterations between checkpoints")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for results and checkpoints")
-    parser.add_argument(
-        "--resume", type=Path, metavar="RUN", help="go on with a run that was stopped, as it was set up"
-    )
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="resume a stopped run with its own settings")
     return parser
 
 
@@ -149,7 +147,7 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
 
 
 def run(task: Task, parser: argparse.ArgumentParser) -> None:
-    """Parse the command line, train (or go on), and run inference episodes with the best checkpoint."""
+    """Parse the command line, train (or resume), and run inference episodes with the best checkpoint."""
     args = parser.parse_args()
     check_arguments(parser, args)
     gpus = gpus_asked_for(parser)

@@ -66,7 +66,7 @@ class InterruptError(Exception):
 
 @dataclass(frozen=True)
 class Run:
-    """A training run: what to resume it with, and what decides which checkpoint is best."""
+    """A training run: how to resume it, and the metric of its best checkpoint."""
 
     algorithm: str
     env_id: str
@@ -87,7 +87,7 @@ class Trial:
     settings: dict[str, Any]  # the swept ones
     iterations: int
     env_steps: int
-    trained_steps: float  # what the learner has seen of them, each as often as it was seen
+    trained_steps: float  # steps that the learner has seen, repetitions counted
     score: float  # the last one reported
     best_score: float
     best_checkpoint: Path | None
@@ -97,7 +97,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run left: its trials, the best one first."""
+    """Outcome of a run: its trials, the best one first."""
 
     folder: Path
     trials: tuple[Trial, ...]
@@ -112,7 +112,7 @@ def main_with_sentences(main: Callable[[], None], script: str) -> NoReturn:
     try:
         main()
     except InterruptError as stopped:
-        print(f"stopped; go on with: python {script} --resume {stopped.folder}", flush=True)
+        print(f"stopped; continue with: python {script} --resume {stopped.folder}", flush=True)
         sys.exit(INTERRUPTED)
     except KeyboardInterrupt:
         print("stopped", file=sys.stderr)
@@ -124,7 +124,7 @@ def main_with_sentences(main: Callable[[], None], script: str) -> NoReturn:
 
 
 def default_config(algorithm: str, log_level: str = "ERROR") -> AlgorithmConfig:
-    """Return RLlib's default configuration of an algorithm, without what RLlib says about itself on the way.
+    """Return RLlib's default configuration of an algorithm, without RLlib's own messages.
 
     Registering the algorithms makes an environment that breaks its own space (DreamerV3's, ray 2.60), and each
     configuration announces that the default API stack is the default.
@@ -154,9 +154,11 @@ def ray_session(
 
     Raises UsageError when the cluster cannot be reached.
     """
-    told = log_level in ("DEBUG", "INFO")
-    quiet: dict[str, Any] = {"log_to_driver": told, "logging_level": logging.INFO if told else logging.ERROR}
-    logging.getLogger("ray.tune").setLevel(logging.INFO if told else logging.CRITICAL)  # the cause is told at the end
+    is_verbose = log_level in ("DEBUG", "INFO")
+    level = logging.INFO if is_verbose else logging.ERROR
+    quiet: dict[str, Any] = {"log_to_driver": is_verbose, "logging_level": level}
+    # The cause of a failed trial is reported at the end.
+    logging.getLogger("ray.tune").setLevel(logging.INFO if is_verbose else logging.CRITICAL)
     logging.getLogger("tensorboardX").setLevel(logging.ERROR)  # it warns of a return that is -inf (`fill_return`)
     folder: str | None = None
     own = str((app_dir or Path()).resolve())
@@ -202,7 +204,7 @@ def _start(folder: str, num_cpus: int, num_gpus: float, quiet: Mapping[str, Any]
             ray.shutdown()
             if attempt == attempts - 1:
                 raise errors.RlservoError(f"Ray did not start: {_first_line(error)}") from error
-            print(f"Ray did not start ({_first_line(error)}); once more", file=sys.stderr, flush=True)
+            print(f"Ray did not start ({_first_line(error)}); trying again", file=sys.stderr, flush=True)
 
 
 def _join(address: str, quiet: Mapping[str, Any]) -> None:
@@ -211,7 +213,7 @@ def _join(address: str, quiet: Mapping[str, Any]) -> None:
         if colon and "/" not in address:  # Ray itself tries for minutes
             socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
         ray.init(address, **quiet)
-    except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all say the same
+    except Exception as error:  # Ray's own tree, RuntimeError, ConnectionError, ValueError: all mean the same
         raise errors.UsageError(
             f"--address {address}: no Ray cluster answers there ({_first_line(error)}); start one with "
             "'ray start --head', with the same RAY_AUTH_MODE and token as here"
@@ -232,7 +234,7 @@ def local_gpus() -> float:
 
 @contextlib.contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
-    """Let SIGTERM do what Ctrl-C does; gives the function that says so again."""
+    """Let SIGTERM do what Ctrl-C does; returns the function that installs it again."""
 
     def forward(number: int, frame: FrameType | None) -> None:
         handler = signal.getsignal(signal.SIGINT)  # Tune's while it runs, Python's otherwise
@@ -293,13 +295,13 @@ def stopping(algorithm: Any) -> Iterator[Any]:
 
 
 def pickle_by_value(*modules: ModuleType) -> None:
-    """Let checkpoints load, and other nodes run, where the scripts' own files do not exist."""
+    """Let checkpoints load, and other nodes run, without the scripts' own files."""
     for module in (sys.modules[__name__], failures, *modules):
         cloudpickle.register_pickle_by_value(module)
 
 
 def log_success(*, episode: Any, metrics_logger: Any, **_: Any) -> None:
-    """RLlib's callback at an episode's end: the share of successes, where the environment says so in `info`."""
+    """RLlib's callback at an episode's end: the share of successes, if the environment reports it in `info`."""
     info = episode.get_infos(-1) or {}
     if "is_success" in info:
         metrics_logger.log_value("success_rate", float(info["is_success"]), reduce="mean", window=100)
@@ -353,7 +355,7 @@ class ProgressTable(tune.Callback):
         count, last = failures.read(self._failures)
         if count > self._failed:
             self._failed, self._told_at = count, time.monotonic()
-            print(f"failed in sampling, {count} so far: {last} (all of them: {self._failures})", flush=True)
+            print(f"failed while sampling, {count} so far: {last} (all of them: {self._failures})", flush=True)
         waited_s = time.monotonic() - self._told_at
         if count and waited_s > failures.BUILT_S and all(trial.status == "PENDING" for trial in trials):
             raise RuntimeError(f"{last}, after which the algorithm was not built")  # RLlib sometimes waits for good
@@ -403,7 +405,7 @@ def train(
 ) -> Outcome:
     """Train until one of the stop criteria holds (Ray must be running); see `resume` for what is raised.
 
-    `resumable` is whether the script has a `--resume`, which it then tells of; `where` is what Ray runs on, in words.
+    `resumable` is whether the script has a `--resume` to mention; `where` describes what Ray runs on.
     """
     run = replace(run, request=run.request or resources.request_of(config))
     resources.check_room(run.request, resources.ray_room(where), config=config, concurrent=max_concurrent)
@@ -412,7 +414,7 @@ def train(
     (folder / RUN_FILE).write_text(json.dumps(asdict(run) | {"swept": list(swept)}, indent=2) + "\n")
     failures.watch(config, folder)
     print(f"run: {folder}\ncurves: tensorboard --logdir {folder}", flush=True)
-    print("Ctrl-C stops" + (f"; --resume {folder} goes on" if resumable else ""), flush=True)
+    print("Ctrl-C stops" + (f"; --resume {folder} continues" if resumable else ""), flush=True)
     tuner = tune.Tuner(
         run.algorithm,
         param_space=cast(Any, config),  # Tune takes an AlgorithmConfig, its annotation says dict
@@ -477,9 +479,9 @@ def _trial_name(trial: Any) -> str:
 
 
 def load_run(folder: Path) -> tuple[Run, list[str]]:
-    """Return what `run.json` of a run's folder says, and the names of the swept settings.
+    """Return the content of a run's `run.json`, and the names of the swept settings.
 
-    Raises UsageError when the folder is no run.
+    Raises UsageError if the folder is not a run.
     """
     try:
         document = json.loads((folder / RUN_FILE).read_text())
@@ -494,9 +496,9 @@ def load_run(folder: Path) -> tuple[Run, list[str]]:
 
 
 def resume(folder: Path, *, where: str = "this machine") -> Outcome:
-    """Go on with a run that was interrupted or failed, each trial from its newest checkpoint (Ray must be running).
+    """Resume a run that was interrupted or failed, each trial from its newest checkpoint (Ray must be running).
 
-    Raises UsageError when the folder is no run, or there is not the room that it needs, Interrupted on Ctrl-C and
+    Raises UsageError if the folder is not a run or the resources do not suffice, Interrupted on Ctrl-C and
     RlservoError when a trial fails.
     """
     folder = folder.expanduser().resolve()
@@ -504,7 +506,7 @@ def resume(folder: Path, *, where: str = "this machine") -> Outcome:
     resources.check_room(run.request, resources.ray_room(where))
     default_config(run.algorithm)  # registers the algorithms, quietly
     if not tune.Tuner.can_restore(str(folder)):
-        raise errors.UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it anew")
+        raise errors.UsageError(f"--resume {folder}: the run was stopped before Tune saved anything; start it again")
     try:
         tuner = tune.Tuner.restore(str(folder), run.algorithm, resume_unfinished=True, resume_errored=True)
     except Exception as error:  # a damaged or foreign pickle may raise anything
@@ -535,7 +537,7 @@ def _fit(tuner: tune.Tuner, folder: Path, run: Run, swept: Sequence[str]) -> Out
             cause += f", after an env runner's {last}"
         raise errors.RlservoError(
             f"training failed: {cause}; all of it is in {failed[0].path}/error.txt, and "
-            f"--resume {folder} goes on from the last checkpoint"
+            f"--resume {folder} continues from the last checkpoint"
         )
     if not any(trial.trained_steps for trial in trials):
         raise errors.RlservoError(f"nothing was learned: {failures.nothing_learned(trials[0].env_steps, folder)}")

@@ -61,7 +61,7 @@ def best_checkpoint(
     if not candidates:
         raise CheckpointError(
             f"{root} has no checkpoint with a finite '{metric}'"
-            + (f": reported with its checkpoints were {_closest(reported, metric)}" if reported else "")
+            + (f"; its checkpoints report {_closest(reported, metric)}" if reported else "")
         )
     chosen = max if mode == "max" else min
     return chosen(candidates, key=lambda one: one.score)

@@ -1,6 +1,6 @@
 """Facts that a checkpoint records about itself: algorithm, environment, progress.
 
-None of it changes what the policy does, so none of it may stop an export: what cannot be read is left out, with a
+None of it changes the policy, so none of it may stop an export: facts that cannot be read are left out, with a
 notice. A pruned checkpoint holds these facts as JSON; a full one holds them in RLlib's configuration pickles, which
 this file opens without importing RLlib itself. On the old API stack that is the algorithm's state; a policy's folder on
 its own has only the policy's configuration.
@@ -20,7 +20,7 @@ from rlservo.export.checkpoints.unpickle import unpickle
 from rlservo.export.contract.environment_id import plain_id
 from rlservo.export.contract.errors import CheckpointError
 
-# Where RLlib keeps its counter in algorithm_state.pkl: up to Ray 2.39, 2.40, and from 2.41 on.
+# Path of RLlib's counter in algorithm_state.pkl: up to Ray 2.39, 2.40, and from 2.41 on.
 _STEPS = "num_env_steps_sampled_lifetime"
 _ENV_STEPS = ((_STEPS,), ("env_runners", _STEPS), f"env_runners--{_STEPS}")
 
@@ -41,7 +41,7 @@ class CheckpointFacts:
 
 
 def read_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFacts:
-    """Return what the algorithm checkpoint at `root` says of itself, with a notice for each part that is unreadable."""
+    """Return the facts in the algorithm checkpoint at `root`, with a notice for each unreadable part."""
     if (root / FACTS_FILE).is_file():
         return _from_json(root / FACTS_FILE, notify)
     if not (root / CTOR_FILE).is_file() and old_stack_root(root) is not None:
@@ -72,7 +72,7 @@ def _read_old_facts(root: Path, notify: Callable[[str], None]) -> CheckpointFact
     ):
         kind = spec.get("policy_class")
         name = kind if isinstance(kind, str) else getattr(kind, "__name__", "")
-        algorithm = name.removesuffix("TorchPolicy") or "unknown"  # BC's policy is MARWIL's: not told apart
+        algorithm = name.removesuffix("TorchPolicy") or "unknown"  # BC's policy is MARWIL's: they look the same
         config = _as_mapping(spec.get("config"))
     return CheckpointFacts(
         algorithm=algorithm,

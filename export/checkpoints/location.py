@@ -52,11 +52,11 @@ class CheckpointFiles:
     alone: bool = False
     part: bool = False  # of a MultiRLModule that was saved by itself
     agent_id: str | None = None
-    """The agent that was asked for, if the module serves several."""
+    """The requested agent, if the module serves several."""
 
     @property
     def is_one_of_several(self) -> bool:
-        """Whether the policy goes by an id of its own, and may have others next to it."""
+        """Whether the policy has an id of its own, and may have others next to it."""
         return self.module_id != DEFAULT_POLICY and (self.part or not self.alone)
 
     @property
@@ -80,7 +80,7 @@ class CheckpointFiles:
 
     @property
     def has_pipelines(self) -> bool:
-        """Whether the checkpoint holds the connector pipelines, with what they have learned.
+        """Whether the checkpoint holds the connector pipelines with their learned statistics.
 
         An environment runner that talks to an environment elsewhere has none.
         """
@@ -88,7 +88,7 @@ class CheckpointFiles:
 
     @property
     def is_of_evaluation(self) -> bool:
-        """Whether only evaluation has filled what the connector pipelines have learned."""
+        """Whether only evaluation has filled the statistics of the connector pipelines."""
         return self.runner == self.root / EVALUATION_RUNNER
 
     @property
@@ -112,7 +112,7 @@ class CheckpointFiles:
 
     @property
     def together(self) -> Path:
-        """The file that says of which class the modules are parts."""
+        """The file that names the class which the modules are parts of."""
         return self.root / MODULES / CTOR_FILE
 
     def sha256(self) -> str:
@@ -153,7 +153,7 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: 
         return alone
     if not (root / MODULES).is_dir():
         if agent_id is not None:
-            raise CheckpointError(f"{root} is of the old API stack, whose policies filter alike for all their agents: "
+            raise CheckpointError(f"{root} is of the old API stack, where all agents of a policy share one filter: "
                                   "leave --agent-id out")  # fmt: skip
         return locate_policy(root, given, module_id)
     if root != given and (root / MODULES) in given.parents and module_id is None:
@@ -269,7 +269,7 @@ def _check_complete(files: CheckpointFiles) -> None:
     if (files.root / TRAINING_RUNNER).is_dir() and files.has_root_pipelines:
         raise CheckpointError(
             f"{files.root} has connectors both in {TRAINING_RUNNER}/ and at its root, saved by two trainings: only one "
-            "of them belongs to the weights; move the other away"
+            "of them belongs to the weights; remove the other"
         )
     if files.has_pipelines:
         needed += pipelines

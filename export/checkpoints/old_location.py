@@ -31,7 +31,7 @@ class OldStackFiles:
     api_stack: ClassVar[Literal["old"]] = "old"
 
     root: Path
-    """The algorithm checkpoint; the policy's own folder where that is all there is."""
+    """The algorithm checkpoint, or the policy's own folder if there is nothing else."""
     module_id: str
     """The policy's id, under the name the rest of the exporter has for it."""
 
@@ -41,7 +41,7 @@ class OldStackFiles:
 
     @property
     def is_one_of_several(self) -> bool:
-        """Whether the policy goes by an id of its own, and may have others next to it."""
+        """Whether the policy has an id of its own, and may have others next to it."""
         return self.policy != self.root and self.module_id != DEFAULT_POLICY
 
     @property
@@ -65,7 +65,7 @@ class OldStackFiles:
 def old_stack_root(given: Path) -> Path | None:
     """Return the algorithm checkpoint (or lone policy folder) of the old stack that `given` is or lies in, if any.
 
-    Raises UnsupportedError for one that is too old to say what surrounds its network.
+    Raises UnsupportedError for one that is too old to describe what surrounds its network.
     """
     inside = {POLICIES: given.parent} if given.name == POLICIES else {}
     if given.parent.name == POLICIES:
@@ -90,26 +90,26 @@ def old_stack_root(given: Path) -> Path | None:
 
 
 def locate_policy(root: Path, given: Path, policy_id: str | None) -> OldStackFiles:
-    """Return one policy of the checkpoint at `root`: the one asked for, the one `given` lies in, or the only one.
+    """Return one policy of the checkpoint at `root`: the requested one, the one that `given` is in, or the only one.
 
     Raises CheckpointError when there is no such policy, or several to choose from.
     """
     present = policy_ids(root)
     if not present:
-        present = [policy_id or root.name]  # a policy's folder on its own, which does not tell its id
+        present = [policy_id or root.name]  # a policy's folder on its own, which does not name its id
     elif given.parent == root / POLICIES and policy_id is None:
         policy_id = given.name
     files = OldStackFiles(root, choose(root, present, policy_id, "policy", "policies"))
     if not files.state.is_file():
         raise UnsupportedError(
-            f"{files.policy} holds its state as msgpack, which is not exported: only {POLICY_STATE}, RLlib's default, "
+            f"{files.policy} holds its state as msgpack, which is not supported: only {POLICY_STATE}, RLlib's default, "
             "is; restore the algorithm with RLlib (and msgpack_numpy) and save it again without msgpack"
         )
     return files
 
 
 def choose(root: Path, present: Sequence[str], name: str | None, singular: str, plural: str) -> str:
-    """Return the module or policy that is asked for, or the only one of those `present`. Raises CheckpointError."""
+    """Return the requested module or policy, or the only one of those `present`. Raises CheckpointError."""
     if name is not None and name not in present:
         raise CheckpointError(f"{root} has no {singular} '{name}': it holds {', '.join(present) or 'none'}")
     if name is None and len(present) > 1:

@@ -46,7 +46,7 @@ class Gone:
 
 
 def find_class(find: Callable[[str, str], Any], module: str, name: str, *, missing_ok: bool) -> Any:
-    """Return what a pickle names, which `find` looks up where it is now.
+    """Return the object that a pickle names; `find` looks it up at its present place.
 
     With `missing_ok` a `Gone` stands for what Ray and gym no longer have. Raises ImportError or AttributeError.
     """
@@ -94,7 +94,7 @@ def _statistics(saved: Mapping[str, Any]) -> Mapping[str, Any]:
         return saved
     if "std_array" not in saved:
         raise UnsupportedError(
-            f"the observation filter's statistics are in a form that is not known: expected 'sum_sq_diff_array' (of "
+            f"the observation filter's statistics are in an unknown form: expected 'sum_sq_diff_array' (of "
             f"an older Ray 'std_array') among {', '.join(saved)}"
         )
     mean, squares = saved["mean_array"], saved["std_array"]

@@ -1,7 +1,7 @@
 """Download a checkpoint from any URI that Ray itself reads into a temporary folder, removed afterwards.
 
 Like Ray's own storage it asks pyarrow first (`file://`, `s3://`, `gs://`, `hdfs://`) and then fsspec (`memory://`,
-`abfs://`, `http://`, ... where the package of that protocol is installed).
+`abfs://`, `http://`, ... if the package of that protocol is installed).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _filesystem(uri: str) -> tuple[FileSystem, str]:
     """Return the file system that reads `uri`, and the path on it."""
     from pyarrow.fs import FileSystem, FSSpecHandler, PyFileSystem
 
-    with contextlib.suppress(Exception):  # pyarrow says no in several ways; fsspec has the last word
+    with contextlib.suppress(Exception):  # pyarrow fails in several ways; fsspec is tried next
         native, inside = FileSystem.from_uri(uri)
         return native, inside
     try:

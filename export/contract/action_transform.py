@@ -48,7 +48,7 @@ def to_sent(own: NDArray[Any], transform: Transform, leaf: LeafSpec) -> NDArray[
 def to_own(sent: NDArray[Any], transform: Transform, leaf: LeafSpec) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Return (own actions, which rows were clipped) for actions that were sent, `[rows, *leaf.shape]`.
 
-    An element at a bound may have been clipped: what is given then is the bound, the nearest own action that is sent
+    An element at a bound may have been clipped: then the result is the bound, the nearest own action that is sent
     so, and the row is flagged. All others are exact to rounding.
     """
     rows = len(sent)

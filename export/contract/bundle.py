@@ -205,7 +205,7 @@ def _versions(policy: Path) -> list[Path]:
 
 
 def read_contract(folder: Path, limits: BundleLimits = DEFAULT_LIMITS) -> Contract:
-    """Parse `contract.json`; say in one sentence which field is wrong."""
+    """Parse `contract.json`; an error names the wrong field in one sentence."""
     file = folder / CONTRACT_FILE
     return _parse_contract(file, b"".join(_blocks(file, *limits.of(CONTRACT_FILE))))
 
@@ -304,7 +304,7 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
 
 
 def write_contract(folder: Path, contract: Contract) -> None:
-    """Write contract.json and, with it, SHA256SUMS over all four files, of which the other three must exist.
+    """Write contract.json and, with it, SHA256SUMS over all four files; the other three must exist.
 
     Both are written next to the old ones and then take their names: whatever fails before leaves the bundle as it was.
     """

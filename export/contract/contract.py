@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, field_validator
 from rlservo.export.contract.errors import BundleError
 from rlservo.export.contract.spaces import FrozenModel, Shape, Size, SpaceSpec
 
-VALUE = "value"  # the graph's output of the value head, where it was exported
+VALUE = "value"  # the graph's output of the value head, if it was exported
 REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
@@ -44,8 +44,8 @@ class StateSpec(FrozenModel):
     initial: float | tuple[float, ...] = Field(0.0, description="One number, or one per element in row-major order")
     kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = Field(
         "recurrent",
-        description="'previous_actions' holds the last actions' one-hot codes, oldest first: a caller that acts "
-        "otherwise than the graph's own `action` (exploring) writes that action's code into the end of it",
+        description="'previous_actions' holds the last actions' one-hot codes, oldest first: a caller that sends "
+        "another action than the graph's `action` (exploring) overwrites the last code with that action's",
     )
 
     def initial_value(self, batch: int) -> NDArray[Any]:
@@ -73,7 +73,7 @@ class BakedStep(FrozenModel):
     """One processing step inside the graph, in the order it is applied."""
 
     step: str = Field(description="For example 'mean_std_filter', 'one_hot', 'network', 'mode', 'unsquash', 'clip'")
-    detail: str = Field("", description="A sentence for people")
+    detail: str = Field("", description="A sentence for readers")
     values: dict[str, Any] = Field(default_factory=dict, description="For example count, mean and std of a filter")
 
 
@@ -81,18 +81,18 @@ class Provenance(FrozenModel):
     """Origin of the policy."""
 
     algorithm: str
-    source: str = Field("rllib", description="Which source read it: 'rllib', 'sb3', ...")
+    source: str = Field("rllib", description="Source that read it: 'rllib', 'sb3', ...")
     framework: str = Field("", description="The framework that restored it, with its version")
-    api_stack: Literal["new", "old"] | None = Field(None, description="Of RLlib's")
+    api_stack: Literal["new", "old"] | None = Field(None, description="RLlib's API stack")
     module_id: str
-    agents: tuple[str, ...] = Field(default=(), description="For which agents of a multi-agent environment")
+    agents: tuple[str, ...] = Field(default=(), description="Agents that it acts for in a multi-agent environment")
     module_class: str
     checkpoint_sha256: str = Field(description="Hash over the checkpoint files that were read")
     training_iterations: int | None = None
     env_steps: int | None = None
     env_id: str | None = None
     env_config: dict[str, Any] = Field(default_factory=dict)
-    ray_version: str | None = Field(None, description="The Ray that wrote the checkpoint")
+    ray_version: str | None = Field(None, description="Version of Ray that wrote the checkpoint")
     torch_version: str
     rlservo_version: str
     exported_at: str = Field(description="UTC, ISO 8601")
@@ -132,7 +132,7 @@ class Evaluation(FrozenModel):
     disturbance: str | None = Field(
         default=None, description="As `rlservo verify --disturb` takes it; 'none' in its first row"
     )
-    endings: dict[str, int] = Field(default_factory=dict, description="How many episodes ended in which way")
+    endings: dict[str, int] = Field(default_factory=dict, description="Number of episodes by ending")
     evaluated_at: str
 
 
@@ -150,7 +150,7 @@ class Contract(FrozenModel):
     state: tuple[StateSpec, ...] = ()
     distribution: Distribution | None
     baked_in: tuple[BakedStep, ...]
-    control_rate_hz: float | None = Field(None, gt=0.0, description="The rate the environment asks for actions at")
+    control_rate_hz: float | None = Field(None, gt=0.0, description="Control rate of the environment [Hz]")
     provenance: Provenance
     parity: Parity
     evaluations: tuple[Evaluation, ...] = ()

@@ -28,7 +28,7 @@ them to exit codes.
     │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
     │   ├── RateLimitError        rate-limited             the API key asked more often than it may
     │   ├── LateError             late                     the observation waited too long: send a newer one
-    ├── InternalError             internal                 the server's own fault: its log says more
+    ├── InternalError             internal                 the server's own fault: see its log
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
 """
 
@@ -50,7 +50,7 @@ class RlservoError(Exception):
         self.details: dict[str, Any] = dict(details or {})
 
     def prefix(self, place: str) -> None:
-        """Put where it happened in front of the message; the error stays what it is, for a bare `raise`."""
+        """Put the place in front of the message; the error stays the same, for a bare `raise`."""
         self.message = f"{place}: {self.message}"
         self.args = (self.message,)
 
@@ -260,6 +260,6 @@ def quoted(names: Iterable[str]) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of an exception's text without colours, with its type where the text alone says little."""
+    """Return the first line of an exception's text without colours, with its type if the text alone says little."""
     text = (_COLOURS.sub("", str(error)).strip() or type(error).__name__).splitlines()[0][:300]
     return f"{type(error).__name__}: {text}" if isinstance(error, LookupError) else text

@@ -27,11 +27,11 @@ def open_ort_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSessi
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.log_severity_level = 4  # what goes wrong arrives as an exception; onnxruntime would print it as well
+    options.log_severity_level = 4  # errors arrive as exceptions; onnxruntime would print them as well
     # A second thread spinning for work burns a core that a robot's control loop wants.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # From the path: from bytes onnxruntime 1.31 parses with the interpreter's lock held (0.3 s for 200 MB, in which
-    # nobody acts), keeps them for ever, and takes twice the memory.
+    # From the path: from bytes onnxruntime 1.31 parses with the interpreter's lock held (0.3 s for 200 MB, during
+    # which no policy acts), keeps them indefinitely, and takes twice the memory.
     ort_session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
     ort_session.disable_fallback()  # it would open the file again
     return ort_session

@@ -1,6 +1,6 @@
 """Bounded reading of regular files, and of nothing else.
 
-Whoever may write into a folder that a server reads may put a FIFO, a device or a file without end there: opening the
+Anyone who can write to a folder that a server reads can put a FIFO, a device or an endless file there: opening the
 first blocks, opening the second may do something, reading the third fills the memory.
 """
 

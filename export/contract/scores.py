@@ -1,4 +1,4 @@
-"""Layout of `action_dist_inputs` and `q_values`: which numbers belong to which part of an action."""
+"""Layout of `action_dist_inputs` and `q_values`: the numbers of each part of an action."""
 
 from __future__ import annotations
 

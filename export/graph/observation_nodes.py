@@ -1,4 +1,4 @@
-"""RLlib's env-to-module connectors as torch modules: what happens to an observation before the network sees it.
+"""RLlib's env-to-module connectors as torch modules: observation preprocessing in the graph.
 
 Each takes the observation so far, a tree of tensors `[batch, ...]`, and the policy's state by name, in which a
 stateful one replaces its own entry.
@@ -30,7 +30,8 @@ from rlservo.export.recipe.recipe import (
 )
 from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
 
-# What may be left out of the filter's mean, in units of the filtered observation: below float32's step near 1.
+# The largest part of the filter's mean that may be left out, in units of the filtered observation: below float32's step
+# near 1.
 NEGLIGIBLE = 1e-7
 ATARI_RAM = (128,)
 
@@ -150,7 +151,7 @@ class FilterNode(ObservationNode):
     """RLlib's frozen MeanStdFilter, on an observation that is a single array.
 
     RLlib subtracts in double precision. With single-precision observations the same is reached by subtracting the mean
-    in two parts: the nearest float32, then what that left over (Dekker 1971), where the rest matters at all. Integers
+    in two parts: the nearest float32, then the remainder (Dekker 1971), if it matters at all. Integers
     are filtered in double precision and cut back to integers, as RLlib does it.
     """
 
@@ -289,5 +290,5 @@ class UserNode(ObservationNode):
 
 
 def as_dtype(tensor: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return `tensor` as `dtype`; `to` alone leaves a node in the graph where it is so already."""
+    """Return `tensor` as `dtype`; `to` alone leaves a node in the graph even if nothing changes."""
     return tensor if tensor.dtype == dtype else tensor.to(dtype)

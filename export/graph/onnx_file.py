@@ -1,7 +1,7 @@
 """Write a policy graph as one ONNX file, and run such a file.
 
 Of torch's two exporters the TorchScript-based one comes first: for these graphs it takes 0.2 s where the
-torch.export-based one takes 3 s, and the result is as small and as fast. Where it lacks an operation (sinh) the other
+torch.export-based one takes 3 s, and the result is as small and as fast. If it lacks an operation (sinh), the other
 takes over. Opset 17 or 18 with IR version 8 is read by every onnxruntime from 1.14 on.
 """
 

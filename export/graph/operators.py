@@ -56,7 +56,7 @@ def _is_real(args: tuple[Any, ...], *, integers: bool) -> bool:
 
 
 def _is_negative(x: Tensor) -> Tensor:
-    """Return where the sign bit is set, of zeros too."""
+    """Return a mask of the elements whose sign bit is set, zeros included."""
     if not x.is_floating_point():
         return x < 0
     return (x < 0) | ((x == 0) & (torch.reciprocal(x) < 0))
@@ -140,7 +140,7 @@ def _remainder(a: Any, b: Any) -> Tensor:
 
 
 def _floor_divide(a: Any, b: Any) -> Tensor:
-    """As Python's `//`, whose quotient is whole even where a / b was rounded up to the next number."""
+    """As Python's `//`, whose quotient is whole even if a / b was rounded up to the next number."""
     like = a if isinstance(a, Tensor) else b
     a, b = _tensor(a, like), _tensor(b, like)
     if not torch.result_type(a, b).is_floating_point:
@@ -181,7 +181,7 @@ def _round(x: Tensor, *, decimals: int = 0) -> Tensor:
 
 
 def _cumsum(x: Tensor, dim: int, *, dtype: torch.dtype | None = None) -> Tensor:
-    return torch.cumsum(x.double(), dim).to(dtype or x.dtype)  # torch, too, adds in double precision
+    return torch.cumsum(x.double(), dim).to(dtype or x.dtype)  # torch also adds in double precision
 
 
 def _cumprod(x: Tensor, dim: int, *, dtype: torch.dtype | None = None) -> Tensor:
@@ -310,7 +310,7 @@ SINGLE_ACTIVATIONS = ("celu", "elu", "gelu", "hardsigmoid", "hardswish", "mish",
 
 
 def _in_single_precision(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Compute in single precision, for which alone onnxruntime has the kernel; the network gets no more either."""
+    """Compute in single precision: onnxruntime has no other kernel, and the network gets no more either."""
 
     def composition(x: Tensor, *args: Any, **named: Any) -> Tensor:
         if x.dtype != torch.float64:

@@ -27,7 +27,7 @@ def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> list[s
     UnsupportedError when the network cannot be traced.
     """
     with warnings.catch_warnings(record=True) as caught:
-        # A constant baked in by tracing is what the parity gate is there to find; these say where it comes from.
+        # The parity gate finds constants that tracing baked in; these warnings locate them.
         warnings.simplefilter("always", tracer_warning())
         _ignore_deprecation()
         try:

@@ -10,8 +10,8 @@ difference of large terms: its scale is the largest value seen over all observat
 same, unless the framework's own scores for the two choices are that close.
 
 Far outside the usual, a network takes the small difference of huge terms, and no two orders of adding them agree. What
-is still rounding there, the framework itself tells: a difference also passes when it is at most ROUNDING times what
-its own numbers for that sample move by when every floating-point observation moves by its last bit.
+is still rounding there is measured on the framework itself: a difference also passes if it is at most ROUNDING times
+what its own numbers for that sample move by when every floating-point observation moves by its last bit.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def record_perturbed(start_loop: Callable[[], Loop], references: Sequence[Refere
 def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]:
     if values.dtype.kind != "f":
         return values
-    single = values.astype(np.float32)  # what the network computes with
+    single = values.astype(np.float32)  # the network's precision
     towards = np.where(rng.random(values.shape) < 0.5, np.float32(np.inf), np.float32(-np.inf))
     return np.asarray(np.nextafter(single, towards), values.dtype)
 
@@ -153,10 +153,10 @@ def prove(
 ) -> Parity:
     """Compare every format with what the framework computed and return the largest differences.
 
-    `labels` name the action's elements for the message; `reference` says for the contract what was compared with;
-    `perturb` gives what `record_perturbed` does, called once and only where a difference is too large.
+    `labels` name the action's elements for the message; `reference` names the reference for the contract;
+    `perturb` gives what `record_perturbed` does; it is called once, only if a difference is too large.
 
-    Raises ParityError at the first output that differs, saying which element of which sample by how much.
+    Raises ParityError at the first output that differs, naming element, sample and difference.
     """
     rounding = _Rounding(references, perturb)
     results = {name: _prove_format(name, recipe, references, run, labels, rounding) for name, run in formats.items()}

@@ -13,11 +13,11 @@ ALONE = 4  # samples that are also shown to the framework one at a time
 
 
 def why_different(start_loop: Callable[[], Loop], references: Sequence[Reference], frozen: Sequence[str]) -> str:
-    """Return a clause that says why a graph may differ from the framework's own numbers; '' if nothing is found."""
+    """Return a clause on why a graph may differ from the framework's own numbers; '' if nothing is found."""
     if sample := _depends_on_batch(start_loop, references):
         return (
-            f"{references[0].framework}'s own action for sample {sample[0]} is another when it is alone: the network's "
-            "result depends on the other observations of the batch, which cannot be exported"
+            f"{references[0].framework}'s own action for sample {sample[0]} changes when it is computed alone: the "
+            "network's result depends on the other observations of the batch, which cannot be exported"
         )
     if frozen:
         return (

@@ -40,7 +40,7 @@ class ObservationFilter:
     destd: bool = True
     """Whether the standard deviation divides at all (`de_std_to_one`)."""
     epsilon: float = SMALL_NUMBER
-    """What is added to the standard deviation."""
+    """Number added to the standard deviation."""
     leaf: str = "obs"
     """Which part of the observation is filtered, by input name."""
     keeps_integers: bool = True
@@ -171,7 +171,7 @@ class StateLeaf:
 
 @dataclass(frozen=True)
 class Affine:
-    """What an environment makes of a policy's numbers: `clip(action, -limit, limit) * scale + offset`."""
+    """An environment's scaling of a policy's numbers: `clip(action, -limit, limit) * scale + offset`."""
 
     scale: NDArray[np.float32]
     """Of the action's shape, in its units."""
@@ -180,7 +180,7 @@ class Affine:
     limit: float | None = None
 
     def apply(self, action: NDArray[Any]) -> NDArray[Any]:
-        """Return the action in the environment's units, in numpy: what a graph is compared with."""
+        """Return the action in the environment's units, in numpy: the reference of a graph."""
         limited = action if self.limit is None else np.clip(action, -self.limit, self.limit)
         return np.asarray(limited * self.scale + self.offset)
 
@@ -195,7 +195,7 @@ class Recipe:
     """A Box, Discrete or MultiDiscrete, or a Dict or Tuple of such; a MultiBinary whose mode is "given"."""
     steps: tuple[ObservationStep, ...]
     mode: Mode
-    """Of the Box leaves (discrete ones are always argmax); of the whole action where it is only one leaf."""
+    """Mode of the Box leaves (discrete ones are always argmax), or of the whole action if it is one leaf."""
     transform: Transform
     distribution: DistributionKind | None
     """None if the module picks its action itself and offers no distribution (DQN)."""
@@ -204,7 +204,7 @@ class Recipe:
     action_steps: tuple[UserStep, ...] = ()
     """The user's own connectors between the distribution's mode and unsquashing."""
     affine: Affine | None = None
-    """Of an action that is one Box: what is done to it before it is clipped."""
+    """For an action that is one Box: its transform before it is clipped."""
 
     @property
     def filter(self) -> ObservationFilter | None:

@@ -1,7 +1,7 @@
 """Sample observations for the proof: likely ones, wide ones, and extremes.
 
-They stay inside of bounds, outside of which `out_of_bounds` decides; but a filter that comes first must show its clip.
-A policy with a state is shown sequences, in which episodes end and begin at different steps in different rows. The
+They stay within bounds (`out_of_bounds` decides about others); but a filter that comes first must show its clip.
+A policy with a state is given sequences in which episodes end and begin at different steps in different rows. The
 numbers come from a recipe's observation space and filter.
 """
 
@@ -20,21 +20,21 @@ from rlservo.export.recipe.recipe import ObservationFilter, Recipe
 from rlservo.export.recipe.runners import Inputs
 
 BATCH_SIZES = (1, 2, 257)
-UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) says nothing of the values that occur
+UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) does not describe the values that occur
 WIDE = 10.0  # standard deviations
 EXTREME = 1e3
 SEQUENCE_STEPS = {1: 200, 2: 200, 257: 3}
 LARGE = 4096  # elements of an observation: such a network takes 0.1 s for a step, and TorchScript as much again
 LARGE_SEQUENCE_STEPS = {1: 16, 2: 16, 257: 2}
-NEW_EPISODE = 0.02  # the chance of a row's episode to end at a step, beside the ends that are certain
+NEW_EPISODE = 0.02  # probability that a row's episode ends at a step, besides the certain ends
 
 
 @dataclass(frozen=True)
 class Batch:
     """Observations by input name in the space's dtypes, and what kind they are.
 
-    In a sequence, `restart` says which rows begin an episode; the other rows continue from the batch before. None is a
-    batch of its own.
+    In a sequence, `restart` marks the rows that begin an episode; the other rows continue from the batch before. None
+    is a batch of its own.
     """
 
     kind: str
@@ -127,7 +127,7 @@ def _integers(kind: str, space: Box, rng: np.random.Generator, size: int) -> NDA
 
 
 def _likely(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
-    """Uniform in the space where it is bounded, else as the filter has seen them (without one: standard normal)."""
+    """Uniform if the space is bounded, else distributed as the filter has seen them (without one: standard normal)."""
     low, high, bounded = _bounds(leaf)
     centre, spread = _centre_and_spread(leaf)
     shape = (size, *low.shape)
@@ -150,7 +150,7 @@ def _extreme(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.flo
     corner = np.where(rng.random(shape) < 0.5, np.where(bounded, low, centre), np.where(bounded, high, centre))
     huge = rng.choice([-1.0, 1.0], shape) * EXTREME * np.maximum(spread, 1.0)
     dice = rng.random(shape)
-    zero = np.copysign(0.0, huge)  # angles and divisions tell the two zeros apart
+    zero = np.copysign(0.0, huge)  # angles and divisions distinguish the two zeros
     spoiled = np.where(dice < 0.1, zero, np.where(dice < 0.3, huge, corner))
     rows = rng.random((size, *[1] * low.ndim)) < 0.5
     return _within(leaf, np.where(rows, spoiled, corner))

@@ -34,7 +34,7 @@ def space_spec(
 ) -> SpaceSpec:
     """Return the contract's form of `space`; only a leaf names `elements`, of a nested space by its tensor name.
 
-    A Dict's key of which all leaves are `unread` (by input name) is only mentioned; a Tuple keeps its length. An
+    A Dict's key whose leaves are all `unread` (by input name) is only mentioned; a Tuple keeps its length. An
     action's Discrete loses its `start`: the contract says what goes to `env.step`, and RLlib sends 0 .. n - 1.
     """
     if isinstance(space, Dict):

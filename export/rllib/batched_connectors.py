@@ -1,7 +1,7 @@
 """RLlib's default connectors for one agent, as pieces that take all environments of a runner at once.
 
 RLlib (2.60) passes each environment's observation and action through ten pieces, one by one and each timed, which takes
-as long as the simulator or longer. These give the same numbers, bit by bit. They do where an observation is a Box, an
+as long as the simulator or longer. These give the same numbers, bit by bit. They work if an observation is a Box, an
 action a Box, Discrete or MultiDiscrete, and the network has no memory:
 
     use_batched_connectors(config, observation_filter=True)
@@ -53,7 +53,7 @@ def use_batched_connectors(
     Of the observation's elements `logarithm_of` (their indices) the logarithm is taken, of `sine_and_cosine_of` both;
     `observation_filter` is whether observations then go through a MeanStdFilter; the network sees the last `num_frames`
     of them, `every` steps apart.
-    Connectors of the configuration's own are replaced. How actions are scaled it must say before, with
+    Connectors of the configuration's own are replaced. The configuration must set the scaling of actions before, with
     `environment(normalize_actions=..., clip_actions=...)`.
     """
     # Here, since exports import this module and have no use for RLlib's env runner.
@@ -83,7 +83,7 @@ def use_batched_connectors(
 
 
 def supports(observation_space: Any, action_space: Any) -> bool:
-    """Whether these pieces do for an agent with such spaces, if its network has no memory."""
+    """Whether these pieces suit an agent with such spaces, if its network has no memory."""
     return isinstance(observation_space, Box) and isinstance(action_space, Box | Discrete | MultiDiscrete)
 
 
@@ -132,7 +132,7 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
             if self._update_stats:
                 _push(running.running_stats, row)
             row = _filtered(row, running)
-            episode.observations.data[-1] = row  # what the learner is to see
+            episode.observations.data[-1] = row  # the learner sees this
             if episode.observation_space is not self.observation_space:
                 episode.observation_space = self.observation_space
             rows.append(row)
@@ -180,7 +180,7 @@ class _OfElements(ConnectorV2):
         del input_action_space
         space = _check_box(input_observation_space)
         if len(space.shape) != 1 or space.dtype.kind != "f":
-            raise UsageError(f"observations are {space}: {self.WHAT}s are taken of a vector of floating-point numbers")
+            raise UsageError(f"observations are {space}: {self.WHAT}s need a vector of floating-point numbers")
         if wrong := [index for index in self.elements if not 0 <= index < space.shape[0]]:
             raise UsageError(f"{self.WHAT} of element {wrong[0]}: observations have elements 0 to {space.shape[0] - 1}")
         return Box(*self.bounds(space.low, space.high), dtype=space.dtype)
@@ -204,7 +204,7 @@ class _OfElements(ConnectorV2):
 class Logarithm(_OfElements):
     """The natural logarithm of some elements of a vector, of those below LOWEST its own.
 
-    For distances: what is 5 cm nearer matters at 20 cm and not at 5 m, but a filter divides both alike.
+    For distances: 5 cm matter at 20 cm and not at 5 m, but a filter divides both alike.
     """
 
     LOWEST = 0.05
@@ -269,7 +269,8 @@ class FrameStacking(ConnectorV2):
         space = _check_box(input_observation_space)
         if len(space.shape) != 1:
             raise UsageError(
-                f"observations are {space}: frames are stacked of vectors; RLlib's FrameStacking has images"
+                f"observations are {space}: only frames of vectors are stacked here; RLlib's FrameStacking stacks "
+                "images"
             )
         return Box(np.tile(space.low, self.num_frames), np.tile(space.high, self.num_frames), dtype=space.dtype)
 
@@ -373,7 +374,7 @@ def _draws_the_same() -> bool:
 
 def _check_box(space: Any) -> Any:
     if not isinstance(space, Box):
-        raise UsageError(f"observations are {space}: the batched connectors take a Box, RLlib's own take all")
+        raise UsageError(f"observations are {space}: the batched connectors take a Box, RLlib's own take any space")
     return space
 
 
@@ -396,7 +397,7 @@ def _tensor(rows: list[Any], module: Any, device: Any) -> Any:
 
 
 def _evaluate(module: Any) -> Any:
-    """Put a network into evaluation mode, where it is in training mode."""
+    """Put a network into evaluation mode if it is in training mode."""
     return type(module).eval(module) if module.training else module
 
 

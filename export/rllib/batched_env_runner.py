@@ -44,9 +44,9 @@ REPLACED = (
 
 
 class BatchedEnvRunner(SingleAgentEnvRunner):
-    """Samples a number of steps with the network's actions; whatever else is asked for, RLlib's own does."""
+    """Samples a number of steps with the network's actions; RLlib's own class does everything else."""
 
-    env: Any  # RLlib says of these that they may be None: not while it samples
+    env: Any  # typed as optional by RLlib, but not None while it samples
     module: Any
     _cached_to_module: Any
     _ongoing_episodes: list[Any]

@@ -1,6 +1,6 @@
 """Find a distribution's kind, and the rule by which its deterministic action comes out of its parameters.
 
-Where it is none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
+If it follows none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
 action twice.
 """
 
@@ -55,8 +55,8 @@ def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: 
         ) from error
     if not all(torch.equal(one, other) for one, other in zip(first, second, strict=True)):
         raise UnsupportedError(
-            f"the action distribution {name} draws its deterministic action at random: there is no one action to prove "
-            "an export with; its deterministic form has to give the same action each time"
+            f"the action distribution {name} draws its deterministic action at random: an export can only be proven if "
+            "it gives the same action each time"
         )
     if given.shape[-1] != sum(widths):
         return "given"

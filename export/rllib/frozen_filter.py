@@ -17,7 +17,7 @@ def frozen_filter(running: Any) -> ObservationFilter:
     mean, std = np.asarray(stats.mean, np.float64), np.asarray(stats.std, np.float32)
     if not (np.isfinite(mean).all() and np.isfinite(std).all()):
         raise CheckpointError("the observation filter's mean or standard deviation is not finite: training diverged")
-    clip = float(running.clip) if running.clip else None  # RLlib tests for truth: 0 means no clipping, too
+    clip = float(running.clip) if running.clip else None  # RLlib tests for truth: 0 also means no clipping
     return ObservationFilter(int(stats.n), mean, std, clip, bool(running.demean), bool(running.destd))
 
 
@@ -27,8 +27,8 @@ def why_untrained(files: Files, recipe: Recipe) -> str:
         return ""
     seen = f"{frozen.count:,} observation{'' if frozen.count == 1 else 's'}"
     if isinstance(files, CheckpointFiles) and files.is_of_evaluation:
-        return f"the observation filter's statistics are of {seen} in evaluation, and of none in training"
+        return f"the observation filter's statistics come from {seen} in evaluation and none in training"
     if frozen.count > 1:
         return ""
     clipped = " and clips" if frozen.clip is not None else ""
-    return f"the observation filter's statistics are of {seen}: RLlib divides by 1e-6{clipped}, unlike in training"
+    return f"the observation filter's statistics come from {seen}: RLlib divides by 1e-6{clipped}, unlike in training"

@@ -2,8 +2,8 @@
 
 RLlib's own heads split the mean from the log of the scale with `chunk`, which traces to nine bookkeeping nodes (5
 microseconds of a 13 microsecond policy), and repeat a free scale `len(batch)` times, which traces to a constant. These
-compute the same numbers. RLlib's heads are told by the names of their classes and parts; the parity gate proves the
-rest.
+compute the same numbers. RLlib's heads are recognised by the names of their classes and parts; the parity gate proves
+the rest.
 """
 
 from __future__ import annotations

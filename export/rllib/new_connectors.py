@@ -1,7 +1,7 @@
 """Read off RLlib's new-stack connector pipelines what they do to an observation and to an action.
 
 A piece that is not known is refused by its class name, because leaving it out would change the policy. The pieces are
-known by name and by coming from RLlib itself. A piece of the user's own is taken where it offers `torch_forward`, a
+known by name and by coming from RLlib itself. A piece of the user's own is used if it offers `torch_forward`, a
 function of torch tensors `[batch, ...]` that does the same as the piece.
 """
 
@@ -48,7 +48,7 @@ PLUMBING = frozenset({
     "ListifyDataForVectorEnv",
 })  # fmt: skip
 BATCHES_OBSERVATION = frozenset({"AddObservationsFromEpisodesToBatch", "FrameStacking"})
-"""Pieces that put the observation into the batch: what a later one changes in the episode comes too late."""
+"""Pieces that put the observation into the batch: later changes to the episode come too late."""
 BATCHED_CONNECTORS = "rlservo.export.rllib.batched_connectors"
 """Pieces that do what RLlib's of the same names do; those for observations also batch them."""
 
@@ -90,8 +90,8 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: Age
         is_batched = type(piece).__module__ == BATCHED_CONNECTORS  # and batches what was changed before it
         if step is not None and batched_by and not is_batched:
             raise UnsupportedError(
-                f"the env-to-module connector {name} comes after {batched_by}, which has handed the observation on "
-                "already: what RLlib does then depends on the step before, which is not exported"
+                f"the env-to-module connector {name} comes after {batched_by}, which has already passed the "
+                "observation on: what RLlib does then depends on the previous step, which is not exported"
             )
         if is_batched or (name in BATCHES_OBSERVATION and _comes_from_rllib(type(piece))):
             batched_by = name
@@ -184,7 +184,7 @@ def _flatten(piece: Any, space: Any) -> Flatten:
             raise UnsupportedError(f"{name}: RLlib's own FlattenObservations cannot one-hot {leaf}, which is a grid")
     removed = private_names.get(piece, "_keys_to_remove") if isinstance(space, Dict) else None
     without = tuple(removed or ())
-    # A Box needs no more said, and the contract is shorter for it.
+    # A Box needs no further detail, which keeps the contract short.
     return Flatten() if isinstance(space, Box) else Flatten(space, without)
 
 
@@ -210,7 +210,7 @@ def _filter(piece: Any, space: Any, slot: AgentSlot) -> ObservationFilter:
     if isinstance(space, Box) and np.dtype(space.dtype).kind == "u":
         raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib's result has no sign there and wraps")
     if not isinstance(space, Box | MultiBinary):
-        raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib filters single arrays")
+        raise UnsupportedError(f"MeanStdFilter on {space} is not exported: RLlib filters only single arrays")
     if slot.agent not in piece.get_state():
         raise UnsupportedError(
             "MeanStdFilter keeps no statistics for this agent: with several agents RLlib's own pipeline needs "

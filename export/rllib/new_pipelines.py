@@ -1,6 +1,6 @@
 """Run RLlib's own connector pipelines of the new API stack for one agent, alone or among several.
 
-Where an environment has several agents, an episode is begun in which only the one whose policy is exported acts: an
+If an environment has several agents, the episode is one in which only the exported policy's agent acts: an
 agent's action depends on its own observations alone, because a module that looks at others' is refused. It imports
 ray.rllib, as new_stack.py.
 """
@@ -79,7 +79,7 @@ class Pipelines:
 
 @dataclass(frozen=True)
 class MultiAgentPipelines(Pipelines):
-    """The same among several agents, of which only the slot's acts."""
+    """The same among several agents; only the slot's agent acts."""
 
     slot: AgentSlot
 
@@ -97,7 +97,7 @@ class MultiAgentPipelines(Pipelines):
 
     def begin(self, obs: Any) -> Any:
         """Return an episode that has just been reset."""
-        module = self.slot.module  # whatever the mapping says: whose slot this is has been decided
+        module = self.slot.module  # instead of the mapping: the slot's module is already known
         episode = MultiAgentEpisode(
             observation_space=self.env_to_module.input_observation_space,
             action_space=self.env_to_module.input_action_space,
@@ -129,7 +129,7 @@ def pipelines_of(
 
 
 def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, module_to_env: Any) -> AgentSlot:
-    """Return for which agent a module is exported; SINGLE_AGENT if the environment has only one.
+    """Return the agent that a module is exported for; SINGLE_AGENT if the environment has only one.
 
     A module may serve several: any stands for all where their spaces and the steps before the network are the same.
     Raises CheckpointError when there is no such agent, AgentsDifferError if they differ and none was named, and
@@ -166,7 +166,7 @@ def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, mod
 def _served(mapping: Any, module_id: str, module: Any) -> list[Any]:
     """Return the agents that a module serves, as RLlib asks it.
 
-    All that it could serve if that is drawn in each episode, or where the module was added in training.
+    All that it could serve if that is drawn in each episode, or if the module was added in training.
     """
     agents = list(mapping.input_observation_space.spaces)
     module_of = private_names.get(mapping, "_agent_to_module_mapping_fn")

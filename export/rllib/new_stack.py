@@ -92,7 +92,7 @@ QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn
 class Network(nn.Module):
     """RLlib's inference forward pass as a module that can be traced: network input to named tensors.
 
-    Where the module computes its actions itself, their leaves come first; a recurrent one's next state comes last.
+    If the module computes its actions itself, their leaves come first; a recurrent one's next state comes last.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Network(nn.Module):
         actions: list[Tensor] = []
         next_state: list[Tensor] = []
         outputs: dict[str, Any] = {}
-        # A value alone does not say what to do: then the forward pass is run for the actions or the state.
+        # A value alone does not give an action: then the forward pass is run for the actions or the state.
         for name in self.names if set(self.names) - {"value"} else ("", *self.names):
             # A user's forward may change its batch, so each call gets its own.
             batch = {Columns.OBS: map_tree(lambda leaf: leaf.unsqueeze(1) if stateful else leaf, obs)}
@@ -235,7 +235,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     transform, action_steps = read_action_steps(module_to_env, action_space)
     state = _network_state(module)
     pipelines = pipelines_of(slot, module, env_to_module, module_to_env, observation_space, action_space)
-    # What the module's forward pass gives decides the rule, and running it takes observations.
+    # The output of the module's forward pass decides the rule, and running it takes observations.
     draft = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
     distribution, mode, names = _action_rule(module, _forward_once(pipelines, draft), action_space, notify)
     recipe = dataclasses.replace(draft, mode=mode, distribution=distribution)
@@ -250,7 +250,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     network = Network(traced, names, acts=mode == "given", rule=rule)
     module_class = f"{type(module).__module__}.{name}"
     if files.has_pipelines:
-        # The gate's own copies, read from where RLlib reads them: what the recipe has wrong must not be in both.
+        # The gate's own copies, read from RLlib's place: an error of the recipe must not be in both.
         folder = connectors_that_rllib_restores(files)
         env_to_module, module_to_env = _read_pipelines(files, folder, module, lambda _: None)
         read_observation_steps(env_to_module, files, slot)  # freezes the filter
@@ -261,7 +261,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
 def _read_pipelines(
     files: CheckpointFiles, runner: Path, module: Any, notify: Callable[[str], None]
 ) -> tuple[Any, Any]:
-    """Return both pipelines as the folder `runner` has them; what it does not have comes from the configuration."""
+    """Return both pipelines from the folder `runner`; missing ones come from the configuration."""
     folders = (runner / ENV_TO_MODULE, runner / MODULE_TO_ENV)
     if files.has_pipelines and lists_connectors(folders[0]):
         return _restore(EnvToModulePipeline, folders[0]), _restore(ModuleToEnvPipeline, folders[1])
@@ -401,7 +401,7 @@ def _action_rule(
 ) -> tuple[DistributionKind | None, Mode, tuple[str, ...]]:
     """Return the distribution's kind, how its mode is computed and the outputs' names, by asking the class."""
     name = type(module).__name__
-    has_q_values = isinstance(module, QNetAPI)  # SAC's module has them, too, but gives a distribution
+    has_q_values = isinstance(module, QNetAPI)  # SAC's module has them as well, but gives a distribution
     if has_q_values and Columns.ACTION_DIST_INPUTS not in forward:
         return None, "argmax", (Q_VALUES,)
     if Columns.ACTIONS in forward:

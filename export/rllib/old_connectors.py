@@ -94,7 +94,8 @@ def read_old_transform(action_connectors: Any, action_space: Any) -> Transform:
 
 def _preprocessing(preprocessor: Any) -> list[ObservationStep]:
     name, space = type(preprocessor).__name__, private_names.get(preprocessor, "_obs_space")
-    # Every hundredth observation is checked against the space: it changes no number, but the gate's lie outside, too.
+    # Every hundredth observation is checked against the space: it changes no number, but the gate's samples also lie
+    # outside.
     preprocessor.check_shape = _accept
     if name == "NoPreprocessor":
         return []

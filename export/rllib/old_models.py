@@ -61,7 +61,7 @@ PARTS = (
 def register_custom_parts(model_config: Mapping[str, Any], app_dir: Path) -> None:
     """Put the custom model and distribution that `model_config` names into RLlib's registry, unless they are there.
 
-    Raises CheckpointError when the code in `app_dir` does not say which class has that name, or it cannot be imported.
+    Raises CheckpointError when the code in `app_dir` does not register a class of that name, or it cannot be imported.
     """
     registry = private_names.find("ray.tune.registry", "_global_registry")
     for part in PARTS:
@@ -131,7 +131,7 @@ def _branches(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def _imports(tree: ast.AST) -> Iterator[tuple[str, Registration]]:
-    """Yield each name that a `from module import name` gives a file, and where it comes from."""
+    """Yield each name that a `from module import name` gives a file, and its origin."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
             for alias in node.names:

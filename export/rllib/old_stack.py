@@ -48,7 +48,7 @@ from rlservo.export.rllib.older_policies import MIXTURES, update_policy_state
 from rlservo.export.rllib.supported_spaces import check_spaces
 from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
 
-AGENT = "agent0"  # what RLlib calls the one agent of an environment
+AGENT = "agent0"  # RLlib's name for the one agent of an environment
 
 
 class OldStackNetwork(nn.Module):
@@ -74,7 +74,7 @@ def _distribution(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Tensor, A
     """Return (distribution parameters or Q-values, distribution class, state), as `_compute_action_helper` does it."""
     batch = SampleBatch({SampleBatch.OBS: obs})
     batch.set_get_interceptor(partial(convert_to_torch_tensor, device=policy.device))
-    batch.set_training(True)  # RLlib does so for inference, too
+    batch.set_training(True)  # RLlib also does so for inference
     lengths = torch.ones_like(state[0][:, 0], dtype=torch.long) if state else None
     how: dict[str, Any] = {"explore": False, "timestep": 0, "is_training": False}
     how.update({"state_batches": state, "seq_lens": lengths})
@@ -259,8 +259,8 @@ def _check_policy(files: OldStackFiles, policy: Any) -> None:
         )
     if isinstance(policy.exploration, ParameterNoise):
         raise UnsupportedError(
-            f"policy {name} explores with ParameterNoise, and RLlib saves its weights with the noise of that moment in "
-            "them (ray 2.60): they are not those it acts with when it does not explore"
+            f"policy {name} explores with ParameterNoise, and RLlib saves its weights with that moment's noise (ray "
+            "2.60): without exploration it acts with others"
         )
     for key in diverged_weights(policy.model):
         raise CheckpointError(f"{files.state}: the weights '{key}' are not all finite: training diverged")

@@ -47,7 +47,7 @@ def restore_older(folder: Path) -> Any:
 
 
 def lists_connectors(folder: Path) -> bool:
-    """Return whether a pipeline's folder says of which connectors it consists: up to Ray 2.38 it holds the spaces."""
+    """Return whether a pipeline's folder lists its connectors: up to Ray 2.38 it holds the spaces."""
     if not is_older(folder):
         return True
     arguments, settings = _arguments(folder)
@@ -68,8 +68,8 @@ def set_saved_state(pipeline: Any, folder: Path) -> None:
     built = {name for name, _ in pipeline.get_checkpointable_components()} - {TIME_AXIS}
     if built != (saved := {child.name for child in folder.iterdir() if child.is_dir()}):
         raise UnsupportedError(
-            f"{folder} holds the connectors {', '.join(sorted(saved))}, and from the checkpoint's configuration follow "
-            f"{', '.join(sorted(built))}: a Ray as early as this one did not save what they are made from"
+            f"{folder} holds the connectors {', '.join(sorted(saved))}, but its configuration gives "
+            f"{', '.join(sorted(built))}: this early Ray did not save their arguments"
         )
     _set_state(pipeline, folder)
 

@@ -48,7 +48,7 @@ def update_policy_state(state: dict[str, Any], files: OldStackFiles) -> None:
 
 
 def _policy_class(found: Any) -> Any:
-    """Return RLlib's name for a policy of its own, which older Rays pickled by value where it had none."""
+    """Return RLlib's name for a policy of its own, which older Rays pickled by value if it had none."""
     if isinstance(found, type) and found.__module__.startswith("ray."):
         found = get_policy_class_name(found) or found.__name__
     if isinstance(found, str) and found not in POLICIES:
@@ -97,8 +97,8 @@ def _worker_filter(files: OldStackFiles) -> dict[str, Any]:
     saved = worker.get("filters", {}).get(files.module_id)
     if saved is None:
         raise UnsupportedError(
-            f"{files.root} does not hold the observation filter's statistics: of a Ray before 2.4 they are in "
-            f"{ALGORITHM_STATE}, beside the policies"
+            f"{files.root} does not hold the observation filter's statistics: before Ray 2.4 they are in "
+            f"{ALGORITHM_STATE}, next to the policies"
         )
     running = RunningStat(np.shape(saved.running_stats.mean_array))
     running.num_pushes, running.mean_array = saved.running_stats.num_pushes, saved.running_stats.mean_array

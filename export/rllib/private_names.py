@@ -1,4 +1,4 @@
-"""Private names of RLlib and Tune that restoring needs: where one is gone, the export is refused by name and version.
+"""Private names of RLlib and Tune that restoring needs: if one is missing, the export is refused by name and version.
 
 docs/reference/support.md lists them.
 """

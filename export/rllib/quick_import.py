@@ -3,7 +3,7 @@
 The `__init__` of nearly every package of Ray's imports all modules below it, so that one RLModule brings Tune, Train,
 Data, pandas and every algorithm (ray 2.60): 1.2 s of processor time for nothing. While this module imports what any
 checkpoint of the new API stack needs, such packages are made without running their `__init__`. It runs later, before
-those below it as usual, when a name of the package or another module below it is asked for: nothing is left out.
+those below it as usual, when a name of the package or another module below it is used: nothing is left out.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ NEEDED = (
     "ray.rllib.core.models.torch.heads",
     "ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module",
 )
-"""Imported while packages are deferred: what a checkpoint of PPO's default module names, or its pipelines."""
+"""Imported while packages are deferred: names in checkpoints of PPO's default module and its pipelines."""
 _TORCH_LIBRARY = "lib/libtorch_python.so"
 
 
 def prepare() -> None:
     """Let this process import less from now on; for a program of ours, as it changes how Ray's packages load.
 
-    torch's shared libraries are mapped beside whatever is imported next, which takes none of Python's lock: a quarter
+    torch's shared libraries are mapped while other modules are imported, which takes none of Python's lock: a quarter
     of a second of torch's import.
     """
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
@@ -55,7 +55,7 @@ def prepare() -> None:
 
 
 def _load_torch_library() -> None:
-    """Map torch's libraries. Where they are elsewhere or cannot be loaded, torch's own import reports it."""
+    """Map torch's libraries. If they are elsewhere or cannot be loaded, torch's own import reports it."""
     spec = find_spec("torch")
     for folder in (spec and spec.submodule_search_locations) or ():
         with contextlib.suppress(OSError):
@@ -126,7 +126,7 @@ class _Loader:
 
 
 class _DeferredPackage(ModuleType):
-    """A package whose `__init__` has not run: it does when a name is asked for that no import has set."""
+    """A package whose `__init__` has not run: it runs when a name is used that no import has set."""
 
     def __getattr__(self, name: str) -> Any:
         spec: Any = self.__spec__

@@ -21,7 +21,7 @@ def check_spaces(
 ) -> None:
     """Raise UnsupportedError unless every leaf of both spaces is of a kind that is exported.
 
-    `steps` are what is done to an observation. `integer_actions` allows Boxes of integers as actions, for which only
+    `steps` are the observation's preprocessing. `integer_actions` allows Boxes of integers as actions, for which only
     RLlib's old stack has a distribution.
     """
     is_cast = bool(steps) and isinstance(steps[0], Flatten | Preprocess)

@@ -1,6 +1,6 @@
 """Action terms of an Isaac Lab or mjlab environment, from the `params/env.yaml` beside a policy.
 
-Scale, offset, joint names and control rate are in there; which joints a pattern means, only the robot's file says.
+Scale, offset, joint names and control rate are in there; which joints a pattern matches is only in the robot's file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _PlainLoader.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
-    """Return the mapping in `file`. Raises CheckpointError where it is none."""
+    """Return the mapping in `file`. Raises CheckpointError if it is not one."""
     try:
         read = yaml.load(file.read_text(encoding="utf-8"), _PlainLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -54,19 +54,19 @@ def read_yaml(file: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ActionTerms:
-    """What the environment makes of a policy's action."""
+    """The environment's processing of a policy's action."""
 
     affine: Affine | None = None
     elements: tuple[Element, ...] = ()
     control_rate_hz: float | None = None
     notes: tuple[str, ...] = ()
-    """Sentences for a person: what could not be told, and is therefore not in the export."""
+    """Warnings: parts that could not be determined, and are therefore not in the export."""
 
 
 def action_terms(env: Mapping[str, Any], size: int, limit: float | None) -> ActionTerms:
     """Return scale, offset and names of the `size` elements of an action that is clipped to ±`limit` before.
 
-    Where a term is of another kind, or its default offset cannot be told, the policy's own numbers stay as they are.
+    If a term is of another kind, or its default offset is unknown, the policy's own numbers stay as they are.
     """
     rate = _rate(env)
     terms = {name: term for name, term in (env.get("actions") or {}).items() if isinstance(term, Mapping)}
@@ -132,7 +132,7 @@ def _joints(patterns: Sequence[str], state: Mapping[str, Any], size: int | None,
     """Return the joints' names in the action's order; empty where only the robot's file knows them.
 
     Isaac Lab writes env.yaml in the order of its settings, so the initial state lists the joints as the robot has them;
-    a file with its keys sorted does not tell.
+    a file with sorted keys does not show.
     """
     if patterns and all(re.fullmatch(r"\w+", each) for each in patterns):
         return list(patterns)
@@ -156,7 +156,7 @@ def _values(given: Any, joints: Sequence[str], count: int, missing: float, what:
             return [float(found[0]) if found else missing for found in matches]
         if list(given) == [".*"]:
             return [float(given[".*"])] * count
-    raise ValueError(f"has a {what} of single joints ({given}) whose order env.yaml does not tell")
+    raise ValueError(f"has a {what} of single joints ({given}) whose order is not in env.yaml")
 
 
 def _rate(env: Mapping[str, Any]) -> float | None:

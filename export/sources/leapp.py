@@ -1,6 +1,6 @@
 """Source of LEAPP bundles: a YAML of stages, their inputs and outputs, and a TorchScript model for each stage.
 
-Stages are chained as the YAML's data flow says; what flows back is the policy's state, whose first values are in a
+Stages are chained by the YAML's data flow; tensors that flow back are the policy's state, whose first values are in a
 safetensors file. Kinds and element names become the contract's names and units.
 """
 
@@ -90,7 +90,7 @@ def _parameters(file: Path, name: str, model: Mapping[str, Any]) -> Mapping[str,
     parameters = model.get("parameters") or {}
     if parameters.get("backend") != "jit":
         raise UnsupportedError(
-            f"{file}: stage '{name}' is of the backend {parameters.get('backend')!r}: only TorchScript can be traced; "
+            f"{file}: stage '{name}' uses the backend {parameters.get('backend')!r}: only TorchScript can be traced; "
             "export it with export_with='jit-trace'"
         )
     return dict(parameters)
@@ -190,7 +190,7 @@ def _tensors(file: Path, stage: str, described: Any) -> list[_Tensor]:
 
 
 def _named(tensors: Mapping[str, _Tensor]) -> dict[str | None, _Tensor]:
-    """Return the tensors by their name in a Dict space; None where there is only one, which needs no Dict."""
+    """Return the tensors by their name in a Dict space; None if there is only one, which needs no Dict."""
     if len(tensors) == 1:
         return {None: next(iter(tensors.values()))}
     short = [key.partition("/")[2] for key in tensors]

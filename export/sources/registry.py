@@ -18,7 +18,7 @@ OURS = (
     "rlservo.export.sources.skrl:Skrl",
     "rlservo.export.sources.leapp:Leapp",
 )
-"""Their modules import no framework. The first one is taken where a path does not exist."""
+"""Their modules import no framework. The first one is used if a path does not exist."""
 
 
 def sources(notify: Notify | None = None) -> list[Source]:
@@ -34,7 +34,7 @@ def sources(notify: Notify | None = None) -> list[Source]:
         if isinstance(made, Source):
             found.append(made)
         elif notify is not None:
-            notify(f"the source '{point.name}' of {point.value} is no rlservo.export.sources.source.Source")
+            notify(f"the source '{point.name}' of {point.value} is not an rlservo.export.sources.source.Source")
     return found
 
 
@@ -58,6 +58,6 @@ def find_source(path: Path, name: str | None = None, notify: Notify | None = Non
         raise CheckpointError(f"{given} may be of several sources ({names}): name one with --source")
     if not mine:
         raise CheckpointError(
-            f"{given} is not a checkpoint that any source knows: {'; '.join(f'{s.name}: {s.expects}' for s in known)}"
+            f"{given} is not a checkpoint of any known source: {'; '.join(f'{s.name}: {s.expects}' for s in known)}"
         )
     return mine[0]

@@ -58,7 +58,7 @@ class RestoredPolicy:
     network: RestoredNetwork
     module_class: str
     start_loop: Callable[[], Loop]
-    """Start the framework acting step after step, exploration off and filter frozen: what an export is compared to."""
+    """Start the framework acting step after step, exploration off and filter frozen: the export's reference."""
     agents: tuple[str, ...] = ()
     """The agents of an environment with several that it is for; empty if there is one, or all are alike."""
     elements: ElementNames | None = None

@@ -54,7 +54,7 @@ class RslRl(Source):
         model = newest_model(given)
         agent = _agent_file(model) if model else None
         if model is None or agent is None:
-            raise CheckpointError(f"{given} is no run of rsl_rl: expected {self.expects}")
+            raise CheckpointError(f"{given} is not a run of rsl_rl: expected {self.expects}")
         environment = agent.with_name(ENVIRONMENT.name)
         files = [model, agent, *([environment] if environment.is_file() else [])]
         return one_policy(model, files, module_id, agent_id)
@@ -88,7 +88,7 @@ def _agent_file(model: Path) -> Path | None:
 
 
 def load_weights(file: Path) -> dict[str, Any]:
-    """Return what `torch.save` wrote, without running code. Raises CheckpointError where that cannot be read."""
+    """Return what `torch.save` wrote, without running code. Raises CheckpointError if it cannot be read."""
     import torch
 
     try:
@@ -112,8 +112,8 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
     if part is None or part not in agent:
         raise UnsupportedError(
             f"{file}: expected the weights and settings of an actor as rsl_rl 5 writes them (actor_state_dict, and "
-            f"'actor' in {agent_file}), got {', '.join(sorted(weights)[:4])}: a run of an older rsl_rl is exported "
-            "after training on, or as a torch module with rlservo.export_policy"
+            f"'actor' in {agent_file}), got {', '.join(sorted(weights)[:4])}: continue a run of an older rsl_rl with "
+            "rsl_rl 5 first, or export its network with rlservo.export_policy"
         )
     state_dict = weights[ACTORS[part]]
     actor, acting = (_actor(file, agent, part, state_dict) for _ in range(2))
@@ -152,7 +152,7 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
 
 
 def _actor(file: Path, agent: Mapping[str, Any], part: str, state_dict: Mapping[str, Tensor]) -> Any:
-    """Return the actor with its weights; sizes are read off the weights, as the checkpoint does not say them."""
+    """Return the actor with its weights; sizes are those of the weights, as the checkpoint does not store them."""
     import torch
     from rsl_rl.models import MLPModel
     from rsl_rl.utils import resolve_class
@@ -223,7 +223,7 @@ def _traced(count: int) -> Any:
 
 
 class _Reference:
-    """rsl_rl's inference policy; it keeps its memory itself, which is set to where the gate's rows are."""
+    """rsl_rl's inference policy; it keeps its memory itself, which is set to that of the gate's rows."""
 
     def __init__(self, actor: Any) -> None:
         self._actor = actor

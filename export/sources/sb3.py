@@ -1,7 +1,8 @@
 """Source of Stable-Baselines3 and sb3-contrib: `model.zip`, and VecNormalize's statistics beside it.
 
-The zip names its policy's class and not its algorithm, which is told by both. Everything that only training needs (the
-replay buffer, schedules, the last observation) is left in the zip, so no code of the user's environment is imported.
+The zip names its policy's class but not its algorithm, which follows from class and settings. Everything that only
+training needs (the replay buffer, schedules, the last observation) is left in the zip, so no code of the user's
+environment is imported.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ HARMLESS: dict[str, Any] = {
     "target_entropy": 0.0, "seed": None, "optimize_memory_usage": False, "replay_buffer_kwargs": {},
     "rollout_buffer_kwargs": {},
 }  # fmt: skip
-"""What training's own settings are replaced with; those that are not named here become None."""
+"""Replacements of training's own settings; those not named here become None."""
 ALGORITHMS = (  # (policy's class, a setting that only this algorithm saves, the algorithm)
     ("sb3_contrib.common.recurrent.policies:RecurrentActorCriticPolicy", "", "sb3_contrib:RecurrentPPO"),
     ("sb3_contrib.common.maskable.policies:MaskableActorCriticPolicy", "", "sb3_contrib:MaskablePPO"),
@@ -74,7 +75,7 @@ class StableBaselines3(Source):
         given = path.expanduser().absolute()
         found = _zips(given)
         if not found:
-            raise CheckpointError(f"{given} is no model of Stable-Baselines3: expected {self.expects}")
+            raise CheckpointError(f"{given} is not a model of Stable-Baselines3: expected {self.expects}")
         if len(found) > 1:
             names = ", ".join(file.name for file in found[:4])
             raise CheckpointError(f"{given} holds {len(found)} models ({names}): name one of them")
@@ -140,7 +141,7 @@ def statistics_beside(model: Path) -> Path | None:
 
 
 def read_data(file: Path) -> dict[str, Any]:
-    """Return the model's settings; those that are no JSON stay pickled."""
+    """Return the model's settings; those that are not JSON stay pickled."""
     try:
         with zipfile.ZipFile(file) as archive:
             return dict(json.loads(archive.read("data")))
@@ -149,7 +150,7 @@ def read_data(file: Path) -> dict[str, Any]:
 
 
 def load_member(file: Path, data: Mapping[str, Any], name: str) -> Any:
-    """Return one of the model's settings. Raises CheckpointError where the code it names cannot be imported."""
+    """Return one of the model's settings. Raises CheckpointError if the code it names cannot be imported."""
     if name not in data:
         raise CheckpointError(f"{file} is incomplete: it holds no '{name}'")
     kept = data[name]
@@ -159,7 +160,7 @@ def load_member(file: Path, data: Mapping[str, Any], name: str) -> Any:
 
 
 def algorithm_path(data: Mapping[str, Any], policy_class: type) -> str:
-    """Return the algorithm of a model as `module:class`; '' where the policy's class is of none that is known."""
+    """Return the algorithm of a model as `module:class`; '' if the policy's class belongs to no known one."""
     for policy, setting, algorithm in ALGORITHMS:
         module, _, name = policy.partition(":")
         if issubclass(policy_class, getattr(importlib.import_module(module), name)) and (
@@ -176,8 +177,8 @@ def load_model(file: Path, data: Mapping[str, Any]) -> Any:
     path = algorithm_path(data, policy_class)
     if not path:
         raise UnsupportedError(
-            f"{file}: the policy class {policy_class.__module__}.{policy_class.__qualname__} is of no algorithm of "
-            "Stable-Baselines3 or sb3-contrib that is known here"
+            f"{file}: the policy class {policy_class.__module__}.{policy_class.__qualname__} belongs to no known "
+            "algorithm of Stable-Baselines3 or sb3-contrib"
         )
     module, _, name = path.partition(":")
     unneeded = {

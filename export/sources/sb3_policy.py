@@ -43,7 +43,7 @@ MASKED = torch.finfo(torch.float32).min
 
 @dataclass(frozen=True)
 class Layout:
-    """How an environment's observation becomes the model's."""
+    """Steps from an environment's observation to the model's."""
 
     frame: Any
     """The space of what the environment gives: one frame, images as they are there."""
@@ -75,9 +75,7 @@ def restore_policy(
         else:
             observation_space = Dict({OBSERVATIONS: layout.frame, ACTION_MASK: mask})
             steps = tuple(replace(step, leaf=f"obs.{OBSERVATIONS}") for step in steps)
-        notify(
-            f"the policy takes action masks: an observation has the key '{ACTION_MASK}', 1 where a choice is allowed"
-        )
+        notify(f"the policy takes action masks: an observation has the key '{ACTION_MASK}', 1 if a choice is allowed")
     state: tuple[StateLeaf, ...] = ()
     if rule.recurrent:
         layers, _, width = policy.lstm_hidden_state_shape
@@ -85,7 +83,7 @@ def restore_policy(
     recipe = Recipe(observation_space, policy.action_space, steps, rule.mode, rule.transform, rule.distribution, state)
     untrained = ""
     if (filtered := recipe.filter) is not None and filtered.count <= 1:
-        untrained = f"VecNormalize's statistics are of {filtered.count} observations"
+        untrained = f"VecNormalize's statistics come from {filtered.count} observations"
     kind = type(policy)
     return RestoredPolicy(
         recipe,
@@ -98,7 +96,7 @@ def restore_policy(
 
 @dataclass(frozen=True)
 class Rule:
-    """How a policy's action comes about, and which of its numbers the graph gives beside it."""
+    """Steps from network to action, and the graph's further outputs."""
 
     mode: Mode
     transform: Transform
@@ -122,7 +120,7 @@ class Rule:
         mode: Mode = "given"
         distribution: DistributionKind | None = None
         scored_by = ""
-        # MaskablePPO's policy is no ActorCriticPolicy, but has the same parts.
+        # MaskablePPO's policy is not an ActorCriticPolicy, but has the same parts.
         if hasattr(policy, "action_net") and hasattr(policy, "action_dist"):
             scored_by = "action_net"
             if discrete:
@@ -197,7 +195,7 @@ class Network(nn.Module):
             mask, obs = _unmask(obs, policy.observation_space)
         if rule.recurrent:
             hidden = tuple(leaf.transpose(0, 1).contiguous() for leaf in state[0])
-            starts = torch.zeros(hidden[0].shape[1])  # the state is an episode's first one where one starts
+            starts = torch.zeros(hidden[0].shape[1])  # the initial state at an episode's start
             distribution, after = policy.get_distribution(obs, hidden, starts)
             next_state = [leaf.transpose(0, 1) for leaf in after]
         elif rule.masked:
@@ -292,12 +290,12 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     """Return how one frame of the environment becomes the model's observation.
 
     VecNormalize's own space says whether it comes before the stack, and of images whether their channels are last.
-    Raises CheckpointError where the statistics or the number of frames do not fit the model.
+    Raises CheckpointError if the statistics or the number of frames do not fit the model.
     """
     models = _leaves(model_space)
     statistics = _leaves(vec.observation_space) if vec is not None else {}
     if statistics and dict.fromkeys(statistics) != dict.fromkeys(models):
-        raise CheckpointError(f"{file}: VecNormalize's statistics are of the parts {', '.join(statistics)}, the model "
+        raise CheckpointError(f"{file}: VecNormalize's statistics cover the parts {', '.join(statistics)}, the model "
                               f"takes {', '.join(models)}: they do not belong together")  # fmt: skip
     stacked: dict[str, tuple[Any, int]] = {}
     frame_spaces: dict[str, Any] = {}
@@ -313,7 +311,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
         if seen is not None and seen.shape != whole.shape:
             if not _fits(seen.shape, whole.shape, axis) or frames not in (1, whole.shape[axis] // seen.shape[axis]):
                 raise CheckpointError(
-                    f"{file}: VecNormalize's statistics are of observations {seen.shape}, the model's are "
+                    f"{file}: VecNormalize's statistics are for observations {seen.shape}, the model's are "
                     f"{model.shape}: they do not belong together"
                 )
             frames = whole.shape[axis] // seen.shape[axis]
@@ -322,7 +320,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
         stacked[key], transposed = (whole, axis), [*transposed, *([key] if channels_last else [])]
     for key, (whole, axis) in stacked.items():
         if frames > 1 and (not isinstance(whole, Box) or not whole.shape or whole.shape[axis] % frames):
-            raise CheckpointError(f"{file}: {whole} is no stack of {frames} frames")
+            raise CheckpointError(f"{file}: {whole} is not a stack of {frames} frames")
         frame_spaces[key] = whole if frames == 1 else _first_frame(whole, axis, frames)
     is_dict = isinstance(model_space, Dict)
     steps = [Transpose(_leaf(key)) for key in transposed]

@@ -1,6 +1,6 @@
 """Source of skrl 2: `agent_*.pt` with the runner's `params/agent.yaml`, as Isaac Lab writes them.
 
-A checkpoint holds weights alone. agent.yaml says which models they are of, and the weights say their sizes; models that
+A checkpoint holds only weights. agent.yaml names their models, and the weights give the sizes; models that
 were written in Python go through `rlservo.export_policy`.
 """
 
@@ -58,7 +58,7 @@ class Skrl(Source):
         given = path.expanduser().absolute()
         found = find_run(given)
         if found is None:
-            raise CheckpointError(f"{given} is no run of skrl: expected {self.expects}")
+            raise CheckpointError(f"{given} is not a run of skrl: expected {self.expects}")
         environment = found[1].with_name("env.yaml")
         files = [*found, *([environment] if environment.is_file() else [])]
         return one_policy(found[0], files, module_id, agent_id)
@@ -150,7 +150,7 @@ def _load(file: Path) -> dict[str, Any]:
 
 
 def _spaces(file: Path, config: Mapping[str, Any], weights: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """Return the spaces of observation, state (None) and action, of which the weights say the sizes."""
+    """Return the spaces of observation, state (None) and action, with the weights' sizes."""
     models = config.get("models") or {}
     of_policy = models.get("policy") or {}
     kind = str(of_policy.get("class", ""))
@@ -158,7 +158,7 @@ def _spaces(file: Path, config: Mapping[str, Any], weights: Mapping[str, Any]) -
         raise UnsupportedError(f"{file}: its policy is a {kind or 'model without a class'}: GaussianMixin, "
                                "DeterministicMixin and CategoricalMixin are exported")  # fmt: skip
     if of_policy.get("clip_mean_actions") or (of_policy.get("clip_actions") and kind.startswith("Deterministic")):
-        raise UnsupportedError(f"{file}: its policy clips to the action space, whose bounds no file of the run says: "
+        raise UnsupportedError(f"{file}: its policy clips to the action space, whose bounds are in no file of the run: "
                                "give the model to rlservo.export_policy")  # fmt: skip
     matrices = [weight for weight in weights["policy"].values() if getattr(weight, "ndim", 0) == 2]
     if not matrices:
@@ -168,7 +168,7 @@ def _spaces(file: Path, config: Mapping[str, Any], weights: Mapping[str, Any]) -
     log_std = weights["policy"].get("log_std_parameter")
     actions = int(log_std.shape[0]) if log_std is not None else int(matrices[-1].shape[0])
     if not models.get("separate", True) and log_std is None:
-        raise UnsupportedError(f"{file}: a shared model does not tell the number of its actions")
+        raise UnsupportedError(f"{file}: a shared model does not give its number of actions")
     # Only sampled actions are clipped to these bounds, which acting without exploration does not give.
     action_space = Discrete(actions) if kind.startswith("Categorical") else Box(-1e30, 1e30, (actions,), np.float32)
     return _unbounded(size), _unbounded(state) if state else None, action_space

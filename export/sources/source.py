@@ -1,6 +1,6 @@
 """Source: a trainer's checkpoints, as the exporter reads them.
 
-A source finds a policy by the names of files, says what loading it takes, and restores it: the recipe around its
+A source finds a policy by the names of files, names what loading it needs, and restores it: the recipe around its
 network, the network to trace, and the framework's own way to act, which the parity gate compares with. How to add one:
 docs/how-to/sources.md.
 """
@@ -35,9 +35,9 @@ class RestoreOptions:
     value: bool = True
     """False leaves the value head out."""
     vecnormalize: Path | None = None
-    """Stable-Baselines3's observation statistics, where they are not beside the model."""
+    """Stable-Baselines3's observation statistics, if they are not beside the model."""
     frame_stack: int = 1
-    """How many frames Stable-Baselines3's VecFrameStack put into one observation."""
+    """Number of frames that Stable-Baselines3's VecFrameStack put into one observation."""
 
 
 class PolicyFiles(Protocol):
@@ -45,7 +45,7 @@ class PolicyFiles(Protocol):
 
     @property
     def root(self) -> Path:
-        """What was found: the checkpoint's file or folder."""
+        """The checkpoint's file or folder."""
         ...
 
     @property
@@ -58,7 +58,7 @@ class PolicyFiles(Protocol):
 
     @property
     def is_one_of_several(self) -> bool:
-        """Whether the policy goes by an id of its own, and may have others beside it."""
+        """Whether the policy has an id of its own, and may have others next to it."""
         ...
 
     def sha256(self) -> str:
@@ -90,7 +90,7 @@ class Source(abc.ABC):
     """A trainer's format. One object serves all exports and keeps nothing."""
 
     name: ClassVar[str]
-    """What `--source` calls it."""
+    """Its name for `--source`."""
     framework: ClassVar[str]
     """The framework as sentences call it."""
     distribution: ClassVar[str]
@@ -98,11 +98,11 @@ class Source(abc.ABC):
     extra: ClassVar[str]
     """The extra of rlservo that installs the framework."""
     packages: ClassVar[tuple[str, ...]] = ()
-    """The modules that must be importable, beside torch and onnx."""
+    """The modules that must be importable, besides torch and onnx."""
     expects: ClassVar[str]
-    """What a path of this source looks like, for the message about a path that no source knows."""
+    """Description of this source's paths, for the message about a path that no source recognises."""
     reference: ClassVar[str]
-    """What the parity gate compares with."""
+    """The parity gate's reference."""
 
     @abc.abstractmethod
     def detects(self, path: Path) -> bool:
@@ -119,8 +119,8 @@ class Source(abc.ABC):
         """Return the files of every policy of a checkpoint."""
         return [self.locate(path, None, None)]
 
-    def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002  # others say it of one file and not of another
-        """Return the clause that warns of what loading runs; '' where it runs no code."""
+    def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002  # others depend on the file
+        """Return the clause that warns of code that loading runs; '' if it runs none."""
         return PICKLES
 
     def facts(self, files: PolicyFiles, notify: Notify) -> CheckpointFacts:  # noqa: ARG002
@@ -136,7 +136,7 @@ class Source(abc.ABC):
 
 
 def one_policy(path: Path, files: Sequence[Path], module_id: str | None, agent_id: str | None) -> SinglePolicy:
-    """Return the only policy of a checkpoint. Raises CheckpointError when another is asked for."""
+    """Return the only policy of a checkpoint. Raises CheckpointError when another is requested."""
     policy = SinglePolicy(path, tuple(files))
     if module_id not in (None, policy.module_id) or agent_id is not None:
         raise CheckpointError(f"{path} holds one policy: leave --module-id and --agent-id out")

@@ -1,4 +1,4 @@
-"""Source of a torch module in memory: the user says what a checkpoint would."""
+"""Source of a torch module in memory: the user gives what a checkpoint would hold."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ModuleFiles:
 
 @dataclass(frozen=True)
 class ModuleSpec:
-    """What the user says of a module (`rlservo.export_policy`)."""
+    """A user's description of a module (`rlservo.export_policy`)."""
 
     observation_space: Any
     action_space: Any

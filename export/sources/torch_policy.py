@@ -31,18 +31,18 @@ class Act(Protocol):
 
 @dataclass(frozen=True)
 class TorchPolicy:
-    """What a source knows of a module: how it is traced and how the framework itself runs it."""
+    """A source's module: the traced form and the framework's own."""
 
     recipe: Recipe
-    """Its mode says what the module's output is: the action ("given"), or scores to choose by ("argmax")."""
+    """Its mode is the kind of the module's output: the action ("given"), or scores to choose by ("argmax")."""
     module: nn.Module
     """It holds all weights."""
     act: Callable[[Any, Tree, list[Tensor]], tuple[Tree, list[Tensor]]]
-    """What is traced, given the module, observation and state: torch operations, without the recipe's steps."""
+    """The traced function of module, observation and state: torch operations, without the recipe's steps."""
     reference: Callable[[], Act]
     """Start the framework's own way to act, of an observation as the environment gives it, as torch tensors."""
     names: tuple[str, ...] = ()
-    """`("q_values",)` or `("action_dist_inputs",)` where the output is scores."""
+    """`("q_values",)` or `("action_dist_inputs",)` if the output is scores."""
 
 
 def restored(
@@ -69,7 +69,7 @@ def restored(
 
 
 def _check_output(policy: TorchPolicy, what: str) -> None:
-    """Raise UnsupportedError where the module does not run on an observation, or gives something of another shape."""
+    """Raise UnsupportedError if the module does not run on an observation, or gives another shape."""
     recipe, pair = policy.recipe, draw_pair(policy.recipe)
     try:
         ActLoop(policy).step(pair, np.ones(2, np.bool_))
@@ -84,7 +84,7 @@ def _check_output(policy: TorchPolicy, what: str) -> None:
 
 
 def _check_shape(recipe: Recipe, values: list[NDArray[Any]], rows: int) -> None:
-    """Raise UnsupportedError where a module gives something of another shape than the action space wants."""
+    """Raise UnsupportedError if a module gives another shape than the action space needs."""
     spaces = list(recipe.action_leaves.values())
     if recipe.mode == "argmax":
         wanted, which = [(rows, sum(parameter_count(space) for space in spaces))], "scores"
@@ -94,7 +94,7 @@ def _check_shape(recipe: Recipe, values: list[NDArray[Any]], rows: int) -> None:
     if got != wanted:
         raise UnsupportedError(
             f"it gives for {rows} observations {which} of shape {', '.join(map(str, got))}, the action space "
-            f"{recipe.action_space} wants {', '.join(map(str, wanted))}"
+            f"{recipe.action_space} expects {', '.join(map(str, wanted))}"
         )
 
 

@@ -59,7 +59,7 @@ class AdminClient(Closeable):
         return self.command(name, "alias", {"alias": alias, "version": version, "expected": expected})
 
     def rollback(self, name: str, alias: str) -> dict[str, Any]:
-        """Let an alias lead where it led before."""
+        """Move an alias back to its previous version."""
         return self.command(name, "rollback", {"alias": alias})
 
     def canary(self, name: str, version: str | None, share: float | None = None) -> dict[str, Any]:

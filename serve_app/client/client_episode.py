@@ -15,7 +15,7 @@ class ClientEpisode:
     """One episode after another, and what of it a request carries.
 
     The recurrent state is here and travels with every request, or with `server_state` it stays with the server: in a
-    session of this client, or on a stream with the connection. The server needs the last action where it limits the
+    session of this client, or on a stream with the connection. The server needs the last action if it limits the
     step from it; it is sent along when the server's may not be the one that the robot was commanded.
     """
 
@@ -61,7 +61,7 @@ class ClientEpisode:
         self._is_lost = self._steps > 0
 
     def request_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any]:
-        """Return what the next request says of the episode.
+        """Return the next request's fields on the episode.
 
         Until its reply came, the server may have acted with an action that no robot has seen.
 
@@ -70,7 +70,7 @@ class ClientEpisode:
         fields: dict[str, Any] = {}
         if self.is_on_server(contract):
             if self._is_lost:
-                raise SessionLostError("the connection broke, and the episode's memory went with it: call reset()")
+                raise SessionLostError("the connection broke and the episode's memory was lost: call reset()")
             fields["reset"] = self._steps == 0
             if self._session_id is not None:
                 if self._has_unanswered_start:

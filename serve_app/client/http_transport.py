@@ -267,7 +267,7 @@ def _connection_pool(url: str, backend: DeadlineBackend, proxy: str | None) -> h
 
 
 def _certificates() -> ssl.SSLContext:
-    """Return what servers are checked against: what SSL_CERT_FILE or SSL_CERT_DIR says, else certifi's."""
+    """Return the certificates that servers are checked against: SSL_CERT_FILE's or SSL_CERT_DIR's, else certifi's."""
     file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
     if file or folder:
         return ssl.create_default_context(cafile=file or None, capath=None if file else folder)

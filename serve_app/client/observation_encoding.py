@@ -1,4 +1,4 @@
-"""Observations in the form in which they are sent: finite numbers, nested as the space is."""
+"""Observations encoded for sending: finite numbers, nested as the space is."""
 
 from __future__ import annotations
 

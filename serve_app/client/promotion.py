@@ -165,7 +165,7 @@ class Promotion:
             return Outcome(STOPPED, f"the canary could not be started: {error.message}")
         self._ends_at = self._clock() + terms.seconds
         self._say(
-            f"watches version {version} of '{name}' beside {self._production} for {_duration(terms.seconds)}, on "
+            f"watches version {version} of '{name}' against {self._production} for {_duration(terms.seconds)}, on "
             f"{', '.join(self._counts.seen)}; the log is {self._log.path}"
         )
         return None
@@ -193,7 +193,7 @@ class Promotion:
     # Watch.
 
     def _watch(self) -> Outcome:
-        """Return the outcome, when there is one. What may pass by itself has a minute for that."""
+        """Return the outcome, when there is one. Temporary faults have a minute to pass."""
         fine_at = self._clock()
         while True:
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
@@ -222,7 +222,7 @@ class Promotion:
         """Return which process does not serve what is watched, in a sentence."""
         for name, process in processes.items():
             if process.plan < self._generation:
-                return f"replica '{name}' follows plan {process.plan:g}, and not yet {self._generation}"
+                return f"replica '{name}' follows plan {process.plan:g}, not yet {self._generation}"
             if self._terms.version not in process.versions:
                 return f"replica '{name}' has not loaded version {self._terms.version}"
         return ""
@@ -248,7 +248,7 @@ class Promotion:
         if served is None:
             return f"policy '{terms.policy}' is no longer served"
         if served.production != self._production:
-            what = f"'{PRODUCTION}' leads to {served.production} and no longer to {self._production}"
+            what = f"'{PRODUCTION}' points to {served.production} and no longer to {self._production}"
         elif terms.version not in served.versions:
             what = f"version {terms.version} is no longer loaded"
         elif served.canary != self._canary:
@@ -272,7 +272,7 @@ class Promotion:
             self._sleep(min(1.0, self._every_s))
 
     def _attempt(self, outcome: Outcome, decided_at: int | None) -> Outcome:
-        """Carry out once; what is done already is not done again."""
+        """Carry out once; finished steps are not repeated."""
         name, version, served = self._terms.policy, self._terms.version, self._served()
         if outcome.outcome == PROMOTED and served is not None and served.production != version:
             changed = self._changed(served)
@@ -313,7 +313,7 @@ class Promotion:
         try:
             generation = int(listing["generation"])
             if generation < self._generation:  # of a worker or replica that has not followed yet
-                raise UnavailableError(f"the server follows plan {generation}, and not yet {self._generation}")
+                raise UnavailableError(f"the server follows plan {generation}, not yet {self._generation}")
             self._generation = generation
             policy = next((policy for policy in listing["policies"] if policy["name"] == self._terms.policy), None)
             return policy and _Served(

@@ -1,6 +1,6 @@
 """Counts of a promotion: by how much the servers' metrics of a policy have grown since it began.
 
-A process counts from its own start. What is summed are its increments from one look to the next; one that disappears
+A process counts from its own start. Its increments between two checks are summed; one that disappears
 keeps what it had, and one that is new counts from its first look. Counters never fall: metrics that do are not trusted.
 """
 
@@ -27,7 +27,7 @@ Numbers = dict[str, float]  # by "name/label/..."
 
 
 class UntrustedError(Exception):
-    """The metrics contradict themselves or what they said before."""
+    """The metrics contradict themselves or an earlier reading."""
 
 
 @dataclass
@@ -61,7 +61,7 @@ def read_metrics(text: str, policy: str) -> dict[str, Process]:
     except (ValueError, KeyError) as error:
         raise UntrustedError(f"the metrics cannot be read: {error!r}") from None
     if not processes:
-        raise UnavailableError(f"the metrics have nothing of a policy '{policy}'")
+        raise UnavailableError(f"the metrics have no series of policy '{policy}'")
     for replica, process in processes.items():
         for version in process.versions:
             counts = [count for _, count in buckets(process.numbers, ANSWERS, version)]

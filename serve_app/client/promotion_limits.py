@@ -27,7 +27,7 @@ from rlservo.serve_app.client.promotion_counts import (
 Z = 3.0  # standard deviations of every interval, 99.7%: it is looked at often, and each look may err
 FEWEST = 3  # cases against a version before anything stops early
 TAIL = 0.01  # of the requests and actions, what a p99 leaves out
-CLIENTS_OWN = frozenset(  # failures that say nothing of the version that was asked
+CLIENTS_OWN = frozenset(  # failures that are not the version's fault
     {
         *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
         *("bad-observation", "session-conflict", "session-lost", "late", "over-capacity", "deadline-passed"),
@@ -56,7 +56,7 @@ class Figure:
     against: float
     cases: float
     allowed: float  # share of the cases
-    lacks: str = ""  # what is missing to decide by it
+    lacks: str = ""  # missing cases for a decision
     surely: float = 0.0  # share that is surely too large, if that is more than `allowed`
 
     @property

@@ -46,7 +46,9 @@ class PromotionLog:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                raise UsageError(f"another 'rlservo policy promote' writes {path}: wait for it, or end it") from None
+                raise UsageError(
+                    f"another 'rlservo policy promote' is writing {path}: wait for it, or stop it"
+                ) from None
             file.seek(0)
             try:
                 yield cls(path, file)
@@ -55,7 +57,7 @@ class PromotionLog:
                     path.unlink(missing_ok=True)
 
     def write(self, event: str, **fields: Any) -> None:
-        """Append an entry, and have the disk keep it: what follows may not be undone. Raises UsageError."""
+        """Append an entry and sync it to disk: the next step may not be undone. Raises UsageError."""
         now = datetime.now(timezone.utc)
         entry = {"time": now.isoformat(timespec="milliseconds"), "event": event, **fields}
         content = b"\n" * self._is_torn + json.dumps(entry).encode() + b"\n"
@@ -64,7 +66,7 @@ class PromotionLog:
                 content = content[self._file.write(content) :]
                 self._is_torn = bool(content)
             os.fsync(self._file)
-        except OSError as error:  # the disk is full, say
+        except OSError as error:  # for example a full disk
             raise UsageError(f"the log {self.path} cannot be written: {error.strerror}") from None
         self._add({**entry, "seconds": now.timestamp()})
 

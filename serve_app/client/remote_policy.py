@@ -1,8 +1,8 @@
 """Base of the HTTP and the WebSocket client of a policy: contract, episode, recording, arguments of a request.
 
 A client that was given no version asks by the policy's name and follows what the server answers with: the alias
-`production`, and a canary's share, as all clients do. What remembers an episode stays with the version that began it
-(the server sees to that), and an answer of a version with other spaces is never used.
+`production`, and a canary's share, as all clients do. A policy with memory stays with the version that began the
+episode (the server sees to that), and an answer of a version with other spaces is never used.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class RemotePolicy(ActingPolicy):
         final_status: str | None = None,
         final_obs: Observation | None = None,
     ) -> None:
-        """Tell the server, and the client's recording, what the last action brought and how the episode ended.
+        """Report the last action's reward and the episode's end to the server and the client's recording.
 
         A reward is sent with the next request, an episode's end by itself, where `final_obs`, the observation after the
         last action, is given: a server that records keeps them, and `rlservo policy promote` counts what ended in
@@ -220,7 +220,7 @@ class RemotePolicy(ActingPolicy):
         self._contract, self._looks_up = contract, False
 
     def _learn(self, contract: Contract) -> None:
-        """Keep the contract of a version; say where it is made for another control rate."""
+        """Keep the contract of a version; warn if it was made for another control rate."""
         known = self._contract
         if contract.version not in self._contracts and known and known.control_rate_hz != contract.control_rate_hz:
             logger.warning(
@@ -249,8 +249,8 @@ class RemotePolicy(ActingPolicy):
             known = self._fetch_new_version(version, deadline)
             if (known.name, known.version) != (contract.name, version):
                 raise UnavailableError(
-                    f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' and has no contract "
-                    "of it: the action was dropped"
+                    f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' but has no contract "
+                    "for it: the action was dropped"
                 )
             self._learn(known)  # also one that is refused next: it is not fetched again
         self._meet(known)

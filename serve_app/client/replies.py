@@ -34,24 +34,25 @@ def answering_version(url: str, reply: Any, number: int, contract: Contract) -> 
 
 
 def check_successor(contract: Contract, known: Contract) -> None:
-    """Refuse a version that another observation goes into, or another action comes out of, than of the known one."""
+    """Refuse a version whose observation or action differs from the known one's."""
     for word, key in (("observation", "obs"), ("action", "action")):
         theirs, ours = (leaf_specs(getattr(each, f"{word}_space"), key) for each in (contract, known))
         if theirs != ours or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
             differing = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
             raise UnavailableError(
-                f"version {contract.version} of policy '{contract.name}' answers now, whose {word} space is another "
-                f"than that of version {known.version}, which this client knows ({', '.join(differing) or word}): the "
+                f"version {contract.version} of policy '{contract.name}' answers now, and its {word} space differs "
+                "from "
+                f"that of version {known.version}, which this client knows ({', '.join(differing) or word}): the "
                 "action was dropped; make a new client, or one with version=",
                 {"version": contract.version, "known": known.version, "differing": differing},
             )
     has_reward, had_reward = (any(tensor.name == REWARD for tensor in each.inputs) for each in (contract, known))
     if has_reward != had_reward:
-        sees = ("is not given", "is given")
+        takes = ("does not take", "takes")
         raise UnavailableError(
-            f"version {contract.version} of policy '{contract.name}' answers now, which {sees[has_reward]} the "
-            f"reward, and version {known.version}, which this client knows, {sees[had_reward]} it: the action was "
-            "dropped; make a new client, or one with version=",
+            f"version {contract.version} of policy '{contract.name}' answers now and {takes[has_reward]} the reward; "
+            f"version {known.version}, which this client knows, {takes[had_reward]} it: the action was dropped; make a "
+            "new client, or one with version=",
             {"version": contract.version, "known": known.version, "differing": [REWARD]},
         )
 
@@ -59,7 +60,7 @@ def check_successor(contract: Contract, known: Contract) -> None:
 def check_step(reply: Mapping[str, Any], steps: int) -> int:
     """Return how many steps the server's memory has come; raise SessionLostError unless it comes from this episode.
 
-    It may be ahead: a step whose answer came too late, or was refused here, has moved it on all the same.
+    It may be ahead: a step whose answer came too late, or was refused here, has moved it on nevertheless.
     """
     step = reply.get("session_step")
     if type(step) is not int or step <= steps or (steps == 0 and step != 1):
@@ -74,7 +75,7 @@ def next_state(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
     """Return the state for the next request; raise UnavailableError if the server gave none."""
     state = reply.get("state")
     if state is None and not contract.state:
-        return {}  # what had to be carried has not to be any more
+        return {}  # the state need not be carried any more
     names = {name for name in state if not name.startswith(MARK)} if isinstance(state, dict) else None
     if not isinstance(state, dict) or names != {spec.name for spec in contract.state}:
         raise UnavailableError(f"the server's answer for {contract.name!r} lacks the state: the action was dropped")

@@ -73,7 +73,7 @@ class StreamClient(RemotePolicy):
         """Check the arguments; nothing is sent before `contract` or `act` needs it.
 
         `policy` may be None if the server has a default policy. `timeout_s` bounds the first contact, `deadline_ms`
-        (by default the same) each `act`, in which a broken connection is replaced. `record` keeps every decision: a
+        (by default the same) each `act`, which also replaces a broken connection. `record` keeps every decision: a
         new .mcap file, a folder, or a Recorder.
         """
         self.url = parse_address(url, SCHEMES)

@@ -33,7 +33,7 @@ class WebSocket:
     def __init__(self, url: str, *, api_key: str | None, deadline: float, label: str) -> None:
         """Connect and shake hands by `deadline` (`time.monotonic`).
 
-        `label` says whose connection it is: when a canary runs, all of a label get the same version.
+        `label` names the connection's owner: when a canary runs, all of a label get the same version.
 
         Raises BrokenError, or HandshakeError when the server answers with an HTTP error.
         """

@@ -29,7 +29,7 @@ Reward: TypeAlias = Callable[[Any, Any, Any], float]
 
 @dataclass(frozen=True)
 class KnownVersion:
-    """A version that this run has made, by what a server's recording says of it."""
+    """A version that this run has made, as a server's recording identifies it."""
 
     version: str
     graph_sha256: str
@@ -43,7 +43,7 @@ class Admitted:
     episode: Episode
     version: KnownVersion
     age: int
-    """How many versions have come after the one that acted."""
+    """Number of versions since the one that acted."""
     rewards: NDArray[np.float64]
 
 
@@ -51,11 +51,11 @@ class Admission:
     """Decides about one episode after the other."""
 
     def __init__(self, policy: str, *, max_age: int, reward: Reward | None = None) -> None:
-        """`reward` stands in for what clients say that each action brought."""
+        """`reward` replaces the rewards that clients report."""
         self._policy, self._max_age, self._reward = policy, max_age, reward
 
     def judge(self, episode: Episode, versions: Sequence[KnownVersion]) -> Admitted | str | None:
-        """Return the episode to learn from, or why not; None where it is another policy's. `versions`: newest last."""
+        """Return the episode, or the reason against it; None if it is another policy's. `versions`: newest last."""
         contract = episode.policy.contract
         if contract.name != self._policy:
             return None
@@ -125,7 +125,7 @@ def _rewards(episode: Episode, reward: Reward) -> NDArray[np.float64]:
 
 
 def reward_of(source: str, name: str) -> Reward:
-    """Return the function `reward` of a Python file's text. Raises UsageError where there is none."""
+    """Return the function `reward` of a Python file's text. Raises UsageError if there is none."""
     namespace: dict[str, Any] = {"__name__": "rlservo_reward"}
     try:
         exec(compile(source, name, "exec"), namespace)

@@ -1,7 +1,7 @@
 """Recordings followed while servers write them: each episode once, as soon as it has ended.
 
 Every poll reads what was added to the files since the last one, to the last whole chunk. A file that cannot be read is
-left out with one sentence, and the others go on.
+left out with one sentence, and the others continue.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class FollowedRecordings:
     """Folders in which servers record."""
 
     def __init__(self, folders: Sequence[Path], notify: Callable[[str], object]) -> None:
-        """`notify` gets one sentence for each file that cannot be read. Raises UsageError for what is no folder."""
+        """`notify` gets one sentence for each file that cannot be read. Raises UsageError if it is not a folder."""
         for folder in folders:
             if not folder.is_dir():
                 raise UsageError(f"--recordings {folder}: expected the folder in which a server records (--record)")
@@ -79,5 +79,5 @@ class FollowedRecordings:
 
 
 def _writer_of(path: Path) -> str:
-    """Return what the files of one process have in common: an episode may go on in its next file."""
+    """Return what the files of one process have in common: an episode may continue in its next file."""
     return str(path.with_name(path.name.rpartition("-")[0])) if FILE_NAME.match(path.name) else str(path)

@@ -21,9 +21,9 @@ from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 from rlservo.serve_app.learning.run_folder import RunFolder
 
 POLL_S = 0.5
-KEPT_LOADED = 3  # versions beside those that may be learned from: robots finish their episodes with them
+KEPT_LOADED = 3  # versions besides those that may be learned from: robots finish their episodes with them
 GATE = (ParityError, CheckpointError, UnsupportedError, BundleError)
-"""How an export refuses a version."""
+"""The errors by which an export refuses a version."""
 NOT_PROVEN = "learned by a version that the gate refused"
 
 
@@ -58,7 +58,7 @@ class OnlineLearning:
         progress: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Release a version every `every` updates; `say` takes a line for each event, `progress` what goes on."""
+        """Release a version every `every` updates; `say` takes a line per event, `progress` the current activity."""
         self._learner, self._run, self._recordings = learner, run, recordings
         self._admission, self._release = admission, release
         self._every, self._max_age = every, max_age
@@ -75,7 +75,7 @@ class OnlineLearning:
             newest = state.versions[-1].version
             self._learner.restore(self._run.checkpoint(newest))
             self._release.serve(newest, self._before(len(state.versions) - 1))
-            self._say(f"goes on from version {newest}: {state.updates} updates, {state.episodes} episodes used")
+            self._say(f"continues from version {newest}: {state.updates} updates, {state.episodes} episodes used")
         released = 0
         while versions is None or released < versions:
             for _ in range(self._every):
@@ -102,7 +102,7 @@ class OnlineLearning:
             state.refused += 1
             state.dropped[NOT_PROVEN] += self._every
             self._run.commit(self._recordings.names())
-            self._say(f"learning goes on from version {newest}")
+            self._say(f"learning continues from version {newest}")
             return False
         self._keep(known)
         self._say(f"version {known.version} is proven, published and loaded after {state.updates} updates")
@@ -187,4 +187,4 @@ def why_interrupted(run: RunFolder) -> str:
     """Return the sentence about a run that was stopped."""
     versions = run.state.versions
     after = f"with version {versions[-1].version}" if versions else "before its first version"
-    return f"stopped {after}; the same command goes on"
+    return f"stopped {after}; the same command continues"

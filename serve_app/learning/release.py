@@ -26,7 +26,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Target:
-    """Where versions go."""
+    """Destination of versions."""
 
     policy: str
     repository: str
@@ -54,7 +54,7 @@ class Release:
     def publish(self, save: Callable[[Path], None]) -> KnownVersion:
         """Save a checkpoint under the next version's number, prove it and publish it.
 
-        Raises ParityError and others where the gate refuses it; then nothing is published.
+        Raises ParityError and others if the gate refuses it; then nothing is published.
         """
         name, place = self._target.policy, self._target.repository
         for _ in range(ATTEMPTS):
@@ -104,8 +104,8 @@ class Release:
                 return
             if there is not None and before is not None and there != before:
                 raise ConflictError(
-                    f"alias '{alias}' of policy '{name}' leads to version {there}, and this run has let it lead to "
-                    f"{before}: does another learner move it? Give each an --alias of its own"
+                    f"alias '{alias}' of policy '{name}' points to version {there}, but this run had moved it to "
+                    f"{before}: is another learner moving it? Give each its own --alias"
                 )
             client.alias(name, alias, version, expected=there)
 

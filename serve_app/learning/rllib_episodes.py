@@ -31,7 +31,7 @@ CANNOT_LEARN = ("FrameStacking",)
 
 @dataclass
 class Recorded:
-    """What recordings hold for a learner: observations as the environment gave them, the module's own actions."""
+    """Episodes for a learner: observations as the environment gave them, the module's own actions."""
 
     contract: Any
     episodes: list[SingleAgentEpisode] = field(default_factory=list)
@@ -83,7 +83,7 @@ def read_recordings(recording: Recording, choice: Choice | None = None, *, name:
             _add(recorded, episode, own, chosen.ahead)
         else:
             recorded.not_used[reason] = recorded.not_used.get(reason, 0) + 1
-    assert recorded is not None, "episodes_of_one raises where there are none"
+    assert recorded is not None, "episodes_of_one raises if there are none"
     if not recorded.episodes:
         reasons = ", ".join(f"{count} {reason}" for reason, count in recorded.not_used.items())
         raise UsageError(f"no recorded episode can be learned from: {reasons}")
@@ -91,7 +91,7 @@ def read_recordings(recording: Recording, choice: Choice | None = None, *, name:
 
 
 def why_not_whole(episode: Episode) -> str | None:
-    """Return what an episode lacks of its decisions or its end; None where it is whole."""
+    """Return the part of its decisions or end that an episode lacks; None if it is whole."""
     if not episode.id or not episode.begins or episode.gap is not None:
         return "without their beginning or with a gap"
     if episode.goes_on:
@@ -100,7 +100,7 @@ def why_not_whole(episode: Episode) -> str | None:
 
 
 def why_without_reward(episode: Episode, rewards: NDArray[np.float64]) -> str | None:
-    """Return what keeps an episode's return from being known; None where it is."""
+    """Return the reason why an episode's return is unknown; None if it is known."""
     if not np.isfinite(rewards).all():
         return "without every reward"
     if not episode.terminated and episode.final_obs is None:
@@ -119,8 +119,8 @@ def single_agent_episode(
 ) -> SingleAgentEpisode:
     """Return a whole episode as `env.step` would have filled RLlib's; not through connectors yet.
 
-    `own` are the module's own actions, leaves `[rows, *shape]`, of which row i + `ahead` is observation i's. With
-    `with_distribution` the episode also holds what the acting module gave beside them: `action_logp`,
+    `own` are the module's own actions, leaves `[rows, *shape]`, row i + `ahead` is observation i's. With
+    `with_distribution` the episode also holds the acting module's other outputs: `action_logp`,
     `action_dist_inputs`.
     """
     contract = episode.policy.contract
@@ -175,7 +175,7 @@ def _add(recorded: Recorded, episode: Episode, own: OwnActions, ahead: int) -> N
 def through_connectors(
     episodes: Sequence[SingleAgentEpisode], env_to_module: Any, *, learn: bool = False
 ) -> list[SingleAgentEpisode]:
-    """Return the episodes as RLlib's environment runner would have left them: what the network saw is in them.
+    """Return the episodes as RLlib's environment runner would have left them, with the network's observations.
 
     The pipeline's own pieces run step by step, and filters change only to `learn`. Raises UsageError for a piece that
     leaves nothing in the episode.

@@ -1,7 +1,7 @@
 """RLlib's learner of a checkpoint, without its algorithm: no environment, no runner, no Ray that is started.
 
 An update takes whole episodes as the acting version's network saw them. The observation filter belongs to acting: its
-statistics grow beside the updates, and act from the next saved version on.
+statistics grow with the updates, and act from the next saved version on.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class OnlineLearner:
         self.restore(self._files.root)
 
     def restore(self, checkpoint: Path) -> None:
-        """Go on from another checkpoint of this learner. Raises CheckpointError."""
+        """Continue from another checkpoint of this learner. Raises CheckpointError."""
         try:
             self._group.restore_from_path(str(checkpoint.absolute() / LEARNER_GROUP))
         except Exception as error:  # a damaged file raises almost anything
@@ -128,7 +128,7 @@ def _files_of(checkpoint: Path) -> CheckpointFiles:
         )
     if not (files.root / CTOR_FILE).is_file():
         raise UsageError(
-            f"{checkpoint} was pruned, or is a module alone: learning goes on from a whole checkpoint, with its "
+            f"{checkpoint} was pruned, or is a module alone: learning continues from a whole checkpoint, with its "
             "configuration and its optimizer"
         )
     return files
@@ -139,7 +139,7 @@ def _config_of(files: CheckpointFiles) -> AlgorithmConfig:
     algorithm = opened["class"]
     if algorithm.__name__ not in ALGORITHMS:
         raise UnsupportedError(
-            f"{files.root} is of {algorithm.__name__}: online learning knows {', '.join(ALGORITHMS)}; "
+            f"{files.root} is of {algorithm.__name__}: online learning supports {', '.join(ALGORITHMS)}; "
             "examples/learn_from_recordings.py learns offline"
         )
     args, kwargs = opened["ctor_args_and_kwargs"]

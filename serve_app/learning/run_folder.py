@@ -1,6 +1,6 @@
-"""Folder of an online learning: its versions, what it has used, and its lock. Whatever ends it, it can go on.
+"""Folder of an online learning run: its versions, used episodes and lock. It can always be resumed.
 
-`learn.json` is replaced at once, and names the newest version that was made, proven and published. What was learned
+`learn.json` is replaced at once, and names the newest version that was made, proven and published. Anything learned
 after it is learned again, from the same episodes: those count as used only from the version on that holds them.
 """
 
@@ -25,10 +25,10 @@ STATE_FILE, LOCK_FILE, REWARD_FILE = "learn.json", ".lock", "reward.py"
 
 @dataclass
 class State:
-    """What a run has come to with its newest version."""
+    """State of a run at its newest version."""
 
     terms: dict[str, Any]
-    """What may not change between two starts of a run."""
+    """Settings that must not change between two starts of a run."""
     versions: list[KnownVersion] = field(default_factory=list)
     """In their order, the newest last."""
     updates: int = 0
@@ -46,7 +46,7 @@ class RunFolder(Closeable):
     """One run's folder, held by one process."""
 
     def __init__(self, path: Path, terms: dict[str, Any], reward_source: str | None) -> None:
-        """Make the folder, or go on with the run in it. Raises UsageError where another holds it, or of other terms."""
+        """Make the folder, or resume the run in it. Raises UsageError if another holds it or settings differ."""
         self.path = path.absolute()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ class RunFolder(Closeable):
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.close()
-            raise UsageError(f"--out {path}: another process learns in it") from None
+            raise UsageError(f"--out {path}: another process is learning in it") from None
         try:
             self.state = self._read(terms, reward_source)
         except BaseException:
@@ -86,7 +86,7 @@ class RunFolder(Closeable):
         return self.checkpoint(version)
 
     def commit(self, present: Collection[str]) -> None:
-        """Write the state; what it says of files that are not `present` any more is dropped."""
+        """Write the state, without files that are no longer `present`."""
         state = self.state
         state.used = {file: keys for file, keys in state.used.items() if file in present}
         part = self.path / f"{STATE_FILE}.part"
@@ -97,7 +97,7 @@ class RunFolder(Closeable):
         part.replace(self.path / STATE_FILE)
 
     def close(self) -> None:
-        """Let another process go on."""
+        """Release the lock."""
         os.close(self._lock)
 
     def _check_ours(self) -> None:

@@ -37,7 +37,7 @@ class Episode:
     goes_on: bool = False
     """Whether another piece follows."""
     ended: bool = False
-    """Whether the recording says how it ended."""
+    """Whether the recording has its end."""
     terminated: bool = False
     truncated: bool = False
     final_status: str | None = None
@@ -90,7 +90,7 @@ class Episode:
 
     @cached_property
     def fell_back(self) -> NDArray[np.bool_]:
-        """Whether the robot was commanded something else."""
+        """Whether the robot was sent another action."""
         return np.array([one is not None for one in self._commands()], np.bool_)
 
     @cached_property
@@ -151,7 +151,7 @@ class Episode:
 
     @cached_property
     def final_obs(self) -> Columns | None:
-        """The observation after the last action, `[1, *shape]`, where it was recorded."""
+        """The observation after the last action, `[1, *shape]`, if it was recorded."""
         last = self._outcomes[-1] if self._outcomes else None
         return (
             None if last is None or "final_obs" not in last else self.policy.observations.columns([last["final_obs"]])
@@ -159,7 +159,7 @@ class Episode:
 
     @property
     def robot(self) -> list[dict[str, Any]]:
-        """Return for each row what a real robot's step said of it (`state`, `changes`, `limited`); empty elsewhere."""
+        """Return each row's report of a real robot's step (`state`, `changes`, `limited`); empty elsewhere."""
         return [{} if one is None else one.get("robot", {}) for one in self._outcomes]
 
     @property

@@ -77,8 +77,8 @@ def _write(
                 ("lacks rewards", "has them") if REWARD in writer.schema.names else ("has rewards", "lacks them")
             )
             raise UsageError(
-                f"episode {episode.id!r} {which}, and the one before it {before}: the frames of a LeRobotDataset have "
-                f"the same columns throughout; convert recordings with and without rewards apart, or to parquet"
+                f"episode {episode.id!r} {which}, and the one before it {before}: all frames of a LeRobotDataset have "
+                "the same columns; convert recordings with and without rewards separately, or to parquet"
             )
         writer.write_table(table)
         row: dict[str, Any] = {

@@ -69,7 +69,7 @@ class LogFile:
 
     @property
     def is_deleted(self) -> bool:
-        """Whether it can no longer be opened: what is written is lost."""
+        """Whether it can no longer be opened: later writes are lost."""
         return os.fstat(self._stream.fileno()).st_nlink == 0
 
     @property

@@ -1,6 +1,6 @@
-"""A module's own actions in a recorded episode: what RLlib's learners learn from.
+"""A module's own actions in a recorded episode, for RLlib's learners.
 
-A record has the own action if it explored. Where it has none, or the robot did something else (a fallback, a step
+A record has the own action if it explored. If it has none, or the robot did something else (a fallback, a step
 limit), the executed action is taken back through unsquash and clip.
 """
 
@@ -83,7 +83,7 @@ def modes(episode: Episode) -> OwnActions:
 
 
 def is_sent_as(sent: NDArray[Any], executed: NDArray[Any], leaf: LeafSpec) -> NDArray[np.bool_]:
-    """Return the rows in which what would be sent is what was executed, but for float32: no step limit was between."""
+    """Return the rows whose own action, when sent, equals the executed one up to float32: no step limit applied."""
     slack: NDArray[np.float64] | float = 0.0
     if isinstance(leaf, BoxSpec):
         low, high = leaf.bounds()

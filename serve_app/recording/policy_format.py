@@ -146,7 +146,7 @@ def json_rows(array: NDArray[Any]) -> list[bytes]:
 
 
 def _object_template(members: Iterable[tuple[str, bytes]]) -> bytes:
-    """Return the JSON of an object of which `%` fills the values in."""
+    """Return the JSON of an object with `%` placeholders for its values."""
     inside = (json.dumps(key).encode().replace(b"%", b"%%") + b":" + value for key, value in members)
     return b"{" + b",".join(inside) + b"}"
 
@@ -290,7 +290,7 @@ _ROBOT: dict[str, Any] = {
             },
         },
     },
-    "limited": {"type": "object", "description": "Cycles in which a limit was kept, by element", "properties": {}},
+    "limited": {"type": "object", "description": "Cycles in which a limit applied, by element", "properties": {}},
 }
 
 

@@ -57,7 +57,7 @@ class FileFacts:
     damage: str | None = None
     """Damage beyond a missing end."""
     position: int = 0
-    """[bytes] How far it was read: a reader goes on from here when its writer has added to it."""
+    """[bytes] Position up to which it was read: a reader continues here when the file has grown."""
     messages: int = 0
     dropped: int = 0
     clock_jumps: int = 0
@@ -162,7 +162,7 @@ class FileReader:
             except RecordingError:
                 raise
             except Exception as error:  # a message that rlservo did not write
-                self._facts.damage = f"read up to a message that cannot be understood: {first_line(error)}"
+                self._facts.damage = f"read up to a message that cannot be decoded: {first_line(error)}"
                 break
             if entry is not None:
                 yield entry

@@ -43,7 +43,7 @@ class WithRecording(ActingPolicy):
     ) -> None:
         """Record to the new file `record` (.mcap), into the folder `record`, or with a Recorder that is there already.
 
-        `wait` is the Recorder's; `act` stands in for `policy.act` where a policy records itself.
+        `wait` is the Recorder's; `act` replaces `policy.act` if a policy records itself.
         """
         self._policy = policy
         self._act = policy.act if act is None else act
@@ -76,7 +76,7 @@ class WithRecording(ActingPolicy):
     def act(
         self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
     ) -> Any:
-        """Return the policy's action and record it; what the policy raises is recorded and raised."""
+        """Return the policy's action and record it; its exceptions are recorded and raised."""
         seen = _copy(obs)  # an environment may write into what it gave
         more: dict[str, Any] = {} if reward is None else {"reward": reward}
         wall_ns, monotonic_ns, began = time.time_ns(), time.monotonic_ns(), time.perf_counter()
@@ -182,7 +182,7 @@ class WithRecording(ActingPolicy):
         return self._format
 
     def _add_details(self, record: DecisionRecord) -> None:
-        """Add what the policy says of its last action."""
+        """Add the policy's details of its last action."""
         failure = getattr(self._policy, "failure", None)  # of a policy with a fallback
         if failure is not None and record.error is None:
             record.action, record.commanded, record.error = None, record.action, failure.code

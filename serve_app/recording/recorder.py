@@ -1,7 +1,7 @@
 """Recorder: a bounded buffer on the hot path, and a thread that writes what is in it to MCAP files.
 
 Recording never gets in the way of acting: `record` takes a microsecond and raises nothing, what does not fit into the
-buffer is dropped and counted (and the file says where), and when a file cannot be written recording ends with one
+buffer is dropped and counted (and the file marks where), and when a file cannot be written recording ends with one
 line in the log.
 """
 
@@ -60,7 +60,7 @@ class Recorder(Closeable):
         max_folder_bytes: int = 10 * 1024 * MIB,
         wait: bool = False,
     ) -> None:
-        """Record to the new file `path` where that ends in .mcap, else into the folder `path`.
+        """Record to the new file `path` if that ends in .mcap, else into the folder `path`.
 
         A folder's file is ended at `max_file_bytes` or after `max_file_s`; of a folder beyond `max_folder_bytes` the
         oldest recordings that are not being written are deleted. With `wait` a full buffer blocks the caller instead of
@@ -68,7 +68,7 @@ class Recorder(Closeable):
         """
         if max_file_bytes < MIB or max_file_s <= 0 or max_folder_bytes < 2 * max_file_bytes:
             raise UsageError(
-                f"a recording's file has at least {MIB} bytes and its folder room for two, got max_file_bytes "
+                f"a recording's file needs at least {MIB} bytes and its folder room for two, got max_file_bytes "
                 f"{max_file_bytes}, max_file_s {max_file_s:g}, max_folder_bytes {max_folder_bytes}"
             )
         self.path = Path(path)
@@ -130,7 +130,7 @@ class Recorder(Closeable):
     def close(self) -> None:
         """Write what is in the buffer and end the file."""
         atexit.unregister(self.close)
-        with self._lock:  # what comes from now on is dropped, so that there is an end
+        with self._lock:  # later records are dropped, so that it ends
             self._closing.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(WAIT_S)

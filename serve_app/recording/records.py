@@ -1,7 +1,7 @@
 """Records: one decision of a policy, and what came of it.
 
 A record is made on the hot path, so it holds what is there anyway; everything else is the writer thread's work. The
-arrays in it must not change any more: who may write into them later gives copies.
+arrays in it must not change any more: a caller that may overwrite them later passes copies.
 """
 
 from __future__ import annotations

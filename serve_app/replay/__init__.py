@@ -1,1 +1,1 @@
-"""Recordings against a bundle: what it would have done, and what return it would have earned."""
+"""Recordings against a bundle: its actions, and an estimate of its return."""

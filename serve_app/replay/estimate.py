@@ -1,7 +1,7 @@
 """Estimate: the return a bundle would have earned, from recordings of another policy, before it drives anything.
 
-Where the recorded actions explored, with known log-probabilities, episodes are weighted by how much likelier the bundle
-makes them (per-decision importance sampling: Precup, Sutton, Singh 2000). Where they did not, a model of the action's
+If the recorded actions explored, with known log-probabilities, episodes are weighted by how much likelier the bundle
+makes them (per-decision importance sampling: Precup, Sutton, Singh 2000). If they did not, a model of the action's
 value is fitted (`fitted_q.py`). Each estimate says whether the recordings can support it, and why not.
 """
 
@@ -202,7 +202,7 @@ def _support(episodes: int, effective: float) -> tuple[bool, str]:
             f"{effective:.1f} of its own, and {SMALLEST_SHARE * episodes:.0f} are needed"
         )
     return True, (
-        f"{episodes} episodes are worth as much as {effective:.0f} of the bundle's own; what happens in fewer than one "
+        f"{episodes} episodes are worth as much as {effective:.0f} of the bundle's own; events in fewer than one "
         f"of {max(1, episodes // 3)} may be missing"
     )
 

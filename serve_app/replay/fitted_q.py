@@ -3,8 +3,8 @@
 The value of an action in a state is a weighted sum of fixed features of both (and of the step, since episodes have a
 time limit), fitted by least squares to the reward and the value of what the bundle would do next, again and again, each
 time within what can be earned in the steps that are left. The same model is fitted to the recorded policy, whose return
-is known: what it gets wrong there is taken off and added to the interval. Two sets of features are fitted, and the
-interval spans both. Where they disagree, where they get the recorded return wrong by much, or where the bundle's
+is known: its error there is subtracted and added to the interval. Two sets of features are fitted, and the
+interval spans both. If they disagree, if they get the recorded return wrong by much, or if the bundle's
 actions are unlike the recorded ones, nothing is claimed.
 """
 
@@ -71,7 +71,7 @@ def fitted_q(episodes: Sequence[Episode], gamma: float, rng: np.random.Generator
         model = _Model(phi, other, rewards, first, last, longest - 1 - steps, gamma)
         ((fitted,), (again,)) = model.values(np.ones((len(phi), 1)))
         values.append(float(known + fitted - again))
-        wider = abs(again - known)  # what the model is known to get wrong
+        wider = abs(again - known)  # the model's known error
         resampled = np.subtract(*model.values(draws.T[of_episode]))
         resampled += draws @ returns / len(kept)
         samples += [resampled - wider, resampled + wider]
@@ -172,7 +172,7 @@ def _basis(rows: NDArray[np.float64], rng: np.random.Generator, *, products: boo
 
 
 def _inside(phi: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """Return the share of the bundle's actions whose features lie where the recorded ones do (their leverage)."""
+    """Return the share of the bundle's actions whose features lie among the recorded ones (their leverage)."""
     size = phi.shape[1]
     gram = phi.T @ phi
     inverse = np.linalg.inv(gram + 1e-6 * np.trace(gram) / size * np.eye(size))

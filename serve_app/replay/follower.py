@@ -1,8 +1,8 @@
-"""Recorded episodes followed by another policy: what it would have done, decision by decision.
+"""Recorded episodes followed by another policy, decision by decision.
 
 A policy that remembers nothing computes an episode's observations at once. A batch's sums may be formed in another
 order, so that last bits differ: if the action is not the recorded one and close to it, the observation is computed
-again by itself, as it was when the robot was driven. Recurrent state and step limits start where the episode did.
+again by itself, as it was when the robot was driven. Recurrent state and step limits start with the episode.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class FollowedEpisode:
     known: NDArray[np.bool_]
     """Whether the bundle's action is known: not without a recorded one, nor after a gap if the policy remembers."""
     unsafe: NDArray[np.bool_]
-    """Whether the bundle's action was none of its space."""
+    """Whether the bundle's action was outside its space."""
     action: dict[str, NDArray[Any]]
     inputs: NDArray[Any] | None
     """The bundle's `action_dist_inputs`, `[rows, n]`."""
@@ -117,7 +117,7 @@ class Follower:
                     answer = policy.follow(obs, gave, before=before, last=last, reward=reward)
                 except ActionError:
                     known[row], unsafe[row] = False, True
-                    if policy.is_stateful:  # what it would remember then is not known either
+                    if policy.is_stateful:  # its memory is unknown then as well
                         known[row + 1 :] = False
                     continue
                 for name, leaf in answer.leaves.items():
@@ -217,7 +217,7 @@ def _add_closeness(
 
 
 def _end_of_memory(episode: Episode, before: State | None, last: dict[str, NDArray[Any]] | None) -> int:
-    """Return the first row for which what the policy remembers of the episode is not known."""
+    """Return the first row at which the policy's memory of the episode is unknown."""
     if not episode.id or (not episode.begins and before is None and last is None):
         return 0
     return len(episode) if episode.gap is None else episode.gap

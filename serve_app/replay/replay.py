@@ -25,7 +25,7 @@ class ElementDifference:
     name: str
     unit: str
     changed: int = 0
-    """Decisions in which it differs by more than the tolerance."""
+    """Decisions that differ by more than the tolerance."""
     largest: float = 0.0
     mean: float = 0.0
     """Of the absolute difference."""
@@ -64,7 +64,7 @@ class ReplayReport:
     """Of those compared: their distributions' parameters were compared, not the draws."""
     largest_distribution_difference: float = 0.0
     unsafe: int = 0
-    """Decisions for which the bundle's action is none of its space."""
+    """Decisions for which the bundle's action is outside its space."""
     not_compared: int = 0
     """Without an action, after a gap in an episode of a policy that remembers, or explored with nothing to compare."""
     other_policies: dict[str, int] = field(default_factory=dict)
@@ -187,7 +187,7 @@ class _Comparison:
         rows: NDArray[np.bool_],
         followed: FollowedEpisode,
     ) -> NDArray[np.bool_]:
-        """Add one leaf's differences; return in which rows an element is beyond the tolerance."""
+        """Add one leaf's differences; return the rows with an element beyond the tolerance."""
         flat = recorded.reshape(len(recorded), -1).astype(np.float64)
         difference = np.abs(replayed.reshape(len(replayed), -1).astype(np.float64) - flat)
         difference[~rows] = 0.0

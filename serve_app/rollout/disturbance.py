@@ -12,7 +12,7 @@
 | stuck | any, or an element's name | an element that keeps its first value |
 | payload | kg | a load the arm does not know of |
 | model | share | masses, inertias, gains, friction, velocities differ by up to this |
-| base | m | the robot stands so far from where it believes to be |
+| base | m | distance of the robot from its believed position |
 | target | outside | a target out of reach |
 | start | corner | the robot starts in a corner |
 

@@ -41,7 +41,7 @@ Z_95 = 1.96
 
 @dataclass(frozen=True)
 class DisturbedRow:
-    """Result under one disturbance. Success is None if the environment does not say."""
+    """Result under one disturbance. Success is None if the environment does not report it."""
 
     disturbance: str
     episodes: int
@@ -64,7 +64,7 @@ class DisturbanceTable:
     policy: str
     version: str
     rows: tuple[DisturbedRow, ...]
-    skipped: dict[str, str]  # disturbance: what the environment lacks
+    skipped: dict[str, str]  # disturbance: the method that the environment lacks
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
@@ -83,7 +83,7 @@ def measure_disturbances(
 ) -> DisturbanceTable:
     """Drive `env_id` under each of the disturbances, and without any, over the seeds from `seed`.
 
-    None given are the standard ones, of which those are left out that the environment cannot do; one that was given
+    None given are the standard ones, without those that the environment does not support; one that was given
     and cannot be done raises UsageError. `progress` gets a line for each row and every few seconds.
     """
     arguments = dict(env_kwargs or {})

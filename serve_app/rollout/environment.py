@@ -38,7 +38,7 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
 
 
 def check_proven(contract: Contract, env: gym.Env[Any, Any]) -> None:
-    """Raise UsageError where the robot is a real one and the policy was never evaluated under latency."""
+    """Raise UsageError if the robot is real and the policy was never evaluated under latency."""
     if not getattr(env.unwrapped, "is_real", False):
         return
     if not any("latency" in (one.disturbance or "") for one in contract.evaluations):
@@ -150,7 +150,7 @@ def _name_difference(expected: SpaceSpec, elements: Any) -> str | None:
 
 
 def _description(env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what the environment class says of itself, if it does: element names and the control rate."""
+    """Return the environment class's description, if it has one: element names and the control rate."""
     describe = getattr(type(env.unwrapped), "describe", None)
     if describe is None:
         return {}

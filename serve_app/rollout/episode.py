@@ -45,7 +45,7 @@ class Episode:
     seed: int | None
     steps: int
     episode_return: float
-    success: bool | None  # None: the environment does not say
+    success: bool | None  # None: the environment does not report it
     final_status: str | None
 
 
@@ -81,7 +81,7 @@ def run_episode(
 
 
 def success_of(info: Mapping[str, Any]) -> bool | None:
-    """Return what an episode's last `info` says of success: `is_success`, else `final_status`, else None."""
+    """Return the success in an episode's last `info`: `is_success`, else `final_status`, else None."""
     if info.get("is_success") is not None:
         return bool(info["is_success"])
     status = info.get("final_status")

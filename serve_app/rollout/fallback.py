@@ -1,7 +1,7 @@
 """Fallback actions for a late or unreachable policy server.
 
 It wraps anything that acts. A control loop that raised because a packet got lost would leave the robot with its last
-command and nobody at the wheel. Which command is the safe one depends on the robot: holding a position setpoint stops
+command and no one in control. Which command is safe depends on the robot: holding a position setpoint stops
 an arm, holding a velocity runs a vehicle into a wall. So there is no default.
 """
 

@@ -38,7 +38,7 @@ class Latency:
 class Link:
     """Counts of the connection to the policy, over every step of the run."""
 
-    fallback: str | None  # what was chosen for when there is no answer
+    fallback: str | None  # the choice for a missing answer
     late: int  # no answer within the deadline
     unavailable: int  # no connection, or a server that refused for now
     lost: int  # the server had lost the episode's memory
@@ -77,7 +77,7 @@ class RolloutReport:
     video: str | None
     link: Link | None = None  # None: nothing was between the loop and its policy
     stopped: str | None = None  # why the loop ended before its episodes did: the fallback is 'stop'
-    disturbance: str | None = None  # what was laid around the environment, as it was written
+    disturbance: str | None = None  # the disturbance of the environment, as given
     step_sizes: dict[str, StepSize] = field(default_factory=dict)  # of "action", and of velocities by unit
     robot: dict[str, int] | None = None  # a real robot's limits: in how many of its cycles each was kept
 

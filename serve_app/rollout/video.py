@@ -40,7 +40,7 @@ class VideoFile(Closeable):
         if self._writer is None:
             import imageio.v2 as imageio
 
-            # macro_block_size 2: what yuv420p needs; the default of 16 would rescale most pictures with a warning.
+            # macro_block_size 2: yuv420p needs it; the default of 16 would rescale most pictures with a warning.
             self._writer = imageio.get_writer(self.path, fps=self._fps, codec="libx264", macro_block_size=2)
         self._writer.append_data(frame)
         self.frames += 1

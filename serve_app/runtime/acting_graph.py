@@ -1,6 +1,6 @@
 """Graph without the value head, which no action needs.
 
-onnxruntime computes every output of a graph, whichever are asked for. A value head is as large as the rest, and its
+onnxruntime computes every output of a graph, requested or not. A value head is as large as the rest, and its
 weights displace the rest from the processor's cache: of an action from two hidden layers of 256 it was a third.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 from rlservo.export.contract.contract import VALUE
 from rlservo.serve_app.wire.protobuf_messages import build_messages
 
-# What is looked at of ONNX's messages (onnx.proto); the rest is passed on as it came.
+# The fields of ONNX's messages (onnx.proto) that are read; the rest is passed on unchanged.
 MESSAGES = {
     "Name": ("string name = 1",),
     "Tensor": ("string name = 8",),

@@ -46,7 +46,7 @@ class ActionCheck:
     def _clip_or_refuse(self, action: NDArray[Any]) -> None:
         slack = rounding_slack(
             self._low, self._high, self._dtype
-        )  # what unsquash may leave outside the space is clipped
+        )  # unsquash may leave values outside the space: they are clipped
         bad = ~((action >= self._low - slack) & (action <= self._high + slack))
         if bad.any():
             label, index = first_element(self._space, bad)

@@ -44,7 +44,7 @@ class CompiledPolicy(Policy):
     """
 
     def __init__(self, path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS) -> None:
-        """Raises BundleError where the folder has no library, and BundleTamperedError for one other than proven."""
+        """Raises BundleError if the folder has no library, BundleTamperedError if it is not the one that was proven."""
         folder = Path(path)
         about = _read_about(folder)
         contract = acting_contract(read_contract(folder))
@@ -97,7 +97,7 @@ class CompiledLibrary:
     """The functions of a shared library, in the form of onnxruntime's session: `run`."""
 
     def __init__(self, file: Path, prefix: str, contract: Contract) -> None:
-        """Raises BundleError where the library cannot be loaded, or is none of a compiled policy."""
+        """Raises BundleError if the library cannot be loaded, or is not that of a compiled policy."""
         try:
             library = ctypes.CDLL(str(file.resolve()))
             self._act, self._reset, self._element = (
@@ -106,7 +106,7 @@ class CompiledLibrary:
             self.state_size = ctypes.c_size_t.in_dll(library, f"{prefix}_state_size").value
             self.bundle = ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(library, f"{prefix}_bundle"))).decode()
         except (OSError, AttributeError, ValueError) as error:
-            raise BundleError(f"{file} is no library of a compiled policy: {error}") from error
+            raise BundleError(f"{file} is not a library of a compiled policy: {error}") from error
         self._act.restype, self._act.argtypes = ctypes.c_int32, [ctypes.c_void_p] * 3
         self._element.restype, self._element.argtypes = ctypes.c_char_p, [ctypes.c_int32]
         self._policy = contract.name
@@ -152,7 +152,7 @@ class CompiledLibrary:
         return codes, outputs
 
     def _memory(self) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
-        """Return this thread's structs: the array of each tensor, and where the structs begin."""
+        """Return this thread's structs: the array of each tensor, and the structs' addresses."""
         if not hasattr(self._own, "structs"):
             places: dict[str, NDArray[Any]] = {}
             raws = []

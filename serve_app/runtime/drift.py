@@ -63,7 +63,7 @@ class Drift:
 
     @property
     def spread(self) -> NDArray[np.float64]:
-        """Standard deviation of z per element: 1 where the observations vary as they did in training."""
+        """Standard deviation of z per element: 1 if the observations vary as they did in training."""
         spread: NDArray[np.float64] = np.sqrt(np.maximum(self._square - self._shift**2, 0.0))
         return spread
 

@@ -32,9 +32,9 @@ def first_element(space: LeafSpec, bad: NDArray[np.bool_]) -> tuple[str, tuple[i
 
 
 def to_array(given: Any) -> NDArray[Any]:
-    """Return numbers out of nested lists as an array, integers exactly where one dtype holds all of them.
+    """Return numbers from nested lists as an array; integers stay exact if one dtype holds all of them.
 
-    Beside smaller ones, numpy makes a float of an integer of 2**63 and more. Raises what numpy raises for lists of
+    Next to smaller ones, numpy turns an integer of 2**63 and more into a float. Raises numpy's error for lists of
     unequal length.
     """
     array = np.asarray(given)
@@ -72,7 +72,7 @@ def find_unfit(array: NDArray[Any], dtype: np.dtype[Any]) -> tuple[NDArray[np.bo
 
 
 def parse_array(given: Any, dtype: str, what: str) -> NDArray[Any]:
-    """Return a caller's numbers as an array, infinite where they are too large for it. Raises RequestError."""
+    """Return a caller's numbers as an array, infinite if they are too large for it. Raises RequestError."""
     try:
         array = to_array(given)
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
@@ -112,7 +112,7 @@ def first_non_number(value: Any, where: tuple[int, ...]) -> tuple[tuple[int, ...
 
 
 def describe_unequal(lists: Sequence[Any]) -> str:
-    """Say which of the lists is not like the first one."""
+    """Describe the list that differs from the first one."""
 
     def form(value: Any) -> tuple[int, ...] | None:
         try:

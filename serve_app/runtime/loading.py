@@ -39,7 +39,7 @@ LARGEST_MADE = 32 << 20
 """[bytes] of a graph that is rebuilt without its value head: acting waits meanwhile, 0.6 ms for each megabyte."""
 
 PROOF_S = 10.0
-"""[s] for the golden vectors, of which a policy's network computes thousands in a second: a graph can have loops."""
+"""[s] Time limit for the golden vectors: a network computes thousands in a second, but a graph can have loops."""
 
 Run = Callable[..., Any]
 """onnxruntime's: output names, inputs by name and, if need be, its options, to arrays."""
@@ -113,13 +113,13 @@ def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
 
 
 def leaves_value_out(bundle: Bundle) -> bool:
-    """Whether what acts is the graph without its value head: if it has one, and is not large."""
+    """Whether the acting graph leaves out its value head: if it has one, and is not large."""
     has_value = any(tensor.name == VALUE for tensor in bundle.contract.outputs)
     return has_value and bundle.onnx.stat().st_size <= LARGEST_MADE
 
 
 def open_graph(bundle: Bundle, threads: int, *, acts_only: bool = False) -> onnxruntime.InferenceSession:
-    """Open the network; `acts_only`: what `leaves_value_out` says. Raises BundleError, BundleTamperedError."""
+    """Open the network; `acts_only`: see `leaves_value_out`. Raises BundleError, BundleTamperedError."""
     with bundle.verified_copy(ONNX_FILE) as file:
         try:
             if acts_only and leaves_value_out(bundle):
@@ -167,7 +167,7 @@ def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> Non
     """Compare the contract with the copy inside the graph: an edited one may have valid hashes."""
     text = ort_session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
     if text is None:
-        return  # a graph that another tool wrote; what of the contract can be seen in it has been compared
+        return  # a graph that another tool wrote; the visible parts of the contract have been compared
     exported = parse_contract(text, f"{bundle.onnx}: the contract inside it is malformed")
     now = bundle.contract.model_copy(update={"evaluations": exported.evaluations})  # `rlservo verify` adds to them
     if now != exported:
@@ -215,7 +215,7 @@ def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str,
     import onnxruntime
 
     options = onnxruntime.RunOptions()
-    options.log_severity_level = 4  # what goes wrong arrives as an exception
+    options.log_severity_level = 4  # errors arrive as exceptions
     end = threading.Timer(PROOF_S, setattr, (options, "terminate", True))
     end.daemon = True
     end.start()
@@ -224,9 +224,7 @@ def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str,
     except Exception:
         if not options.terminate:
             raise
-        raise BundleError(
-            f"{bundle.path}: the graph did not come to an end within {PROOF_S:g} s on its golden vectors"
-        ) from None
+        raise BundleError(f"{bundle.path}: the graph did not finish its golden vectors within {PROOF_S:g} s") from None
     finally:
         end.cancel()
 
@@ -248,7 +246,8 @@ def check_rows(bundle: Bundle, run: Run) -> None:
             _compare(bundle, name, together, singly, GOLDEN_RTOL, GOLDEN_ATOL)
     except Exception as error:  # onnxruntime's own exceptions share no base but Exception
         raise BundleError(
-            f"{bundle.path}: the graph does not compute three observations as it computes each ({first_line(error)}): "
+            f"{bundle.path}: the graph computes three observations together differently than one by one "
+            f"({first_line(error)}): "
             "leave micro_batch out of the policy's options"
         ) from error
 

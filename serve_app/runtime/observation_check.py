@@ -23,7 +23,7 @@ class Observed(NamedTuple):
 
     arrays: dict[str, NDArray[Any]]  # `[batch, ...]` by the graph's input names
     batch: bool  # whether it was given as a batch
-    notices: tuple[str, ...]  # sentences on what is out of bounds and used all the same
+    notices: tuple[str, ...]  # sentences on values that are out of bounds and used nevertheless
 
 
 class ObservationParser:

@@ -2,7 +2,7 @@
 
 It arrives as an array, as nested lists out of JSON, or as a map from element name to value, alone or as a batch. Strict
 where a robot could be hurt: shape, dtype, non-finite numbers and names are errors, never guesses. What happens to a Box
-observation outside the space's bounds is for the policy's options to say: RLlib's own pipeline computes an action for
+observation outside the space's bounds depends on the policy's options: RLlib's own pipeline computes an action for
 it, too.
 """
 
@@ -34,8 +34,8 @@ from rlservo.serve_app.runtime.input_numbers import (
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
-NUMBERS = frozenset({float, int, bool})  # what `struct` reads as the number that it is
-LARGE = 2.0**53  # beyond it an integer is none that a float has, and numpy says which it takes
+NUMBERS = frozenset({float, int, bool})  # types that `struct` reads exactly
+LARGE = 2.0**53  # beyond it floats do not hold every integer; numpy picks one
 PACKED = {"float32": "f", "float64": "d"}
 
 
@@ -75,7 +75,8 @@ class LeafParser:
     def parse(self, obs: Any) -> tuple[NDArray[Any], bool, str]:
         """Return (`[batch, *shape]` of the graph's dtype, whether `obs` was a batch, notice).
 
-        The notice is a sentence on what is out of bounds and used all the same, mostly empty. Raises ObservationError.
+        The notice is a sentence on values that are out of bounds and used nevertheless, mostly empty. Raises
+        ObservationError.
         """
         numbers = self._pack(obs) if type(obs) is list else None
         array, values, batch = self._read(obs) if numbers is None else (*numbers, False)
@@ -154,7 +155,7 @@ class LeafParser:
         return checked and self._out_of_bounds != "accept"
 
     def _keep_bounds(self, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
-        """Do with what is outside the bounds as the options say; return (the array to use, notice)."""
+        """Treat values outside the bounds as the options require; return (the array to use, notice)."""
         outside = np.asarray((array < self._loosest[0]) | (array > self._loosest[1]))
         if not outside.any():
             return array, ""
@@ -281,7 +282,7 @@ class LeafParser:
         )
 
     def _first(self, array: NDArray[Any], bad: NDArray[np.bool_]) -> tuple[str, tuple[int, ...]]:
-        """Return (what the first bad element is called, where it is in the batch)."""
+        """Return (label of the first bad element, its place in the batch)."""
         label, index = first_element(self._space, bad)
         return f"{label} of observation {index[0]}" if len(array) > 1 else label, index
 

@@ -31,11 +31,11 @@ class PolicyOptions(BaseModel):
     micro_batch: Annotated[int, Field(ge=0, le=1024)] = 0
     """The most single observations that a server computes in one run of the network, of those that are there at the
     same time; 0 and 1: each by itself. For large networks. A batch's sums are
-    formed in another order, so the last bits of an action may differ. Computed one by one all the same: policies with a
-    memory or a `max_action_step`, and requests that explore or say anything of an episode."""
+    formed in another order, so the last bits of an action may differ. These are computed one by one nevertheless:
+    policies with a memory or a `max_action_step`, and requests that explore or report on an episode."""
 
     explore: bool = True
-    """Whether clients may ask for exploring actions, where their key lets them. A robot that must not explore asks for
+    """Whether clients may ask for exploring actions, if their key allows it. A robot that must not explore asks for
     none; `false` refuses them to all."""
 
     record: bool = True

@@ -1,6 +1,6 @@
 """Exported policy in this process: an observation in, an action ready for `env.step` out.
 
-This is the file where an observation becomes an action, in `Policy.act`.
+`Policy.act` turns an observation into an action.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Step:
 
     @property
     def own_state(self) -> State:
-        """The state in the observation's own form: without a batch axis where that came alone."""
+        """The state in the observation's own form: without a batch axis if that came alone."""
         return self.state if self.batch is not None else {name: leaf[0, ...] for name, leaf in self.state.items()}
 
 
@@ -121,7 +121,7 @@ class Policy(Closeable):
         self._contract = contract
         self._ort_session: onnxruntime.InferenceSession | None = ort_session
         self._run: Run = ort_session.run
-        self._run_whole: Run | None = None  # with the value head, once that is asked for
+        self._run_whole: Run | None = None  # with the value head, once it is requested
         self._rng: np.random.Generator | None = None  # numpy.random is 2 MB, of use only to policies that explore
         self.options = options
         self.draw: Draw | None = None
@@ -143,7 +143,7 @@ class Policy(Closeable):
         self._last: dict[str, NDArray[Any]] | None = None
         self.has_step_limit = bool(self._step_limit)
         self.is_stateful = bool(contract.state) or self.has_step_limit
-        """Whether an action depends on what came before: on a state, or by a limit on the last action."""
+        """Whether an action depends on earlier steps: by a state, or by a limit on the last action."""
         self.sees_reward = self._state_tensors.has_reward
         """Whether it was trained to see the reward of its last action."""
         # Most policies read one array and give one: those few microseconds are what a control loop asks for.
@@ -290,7 +290,7 @@ class Policy(Closeable):
         last: Mapping[str, NDArray[Any]] | None = None,
         reward: ArrayLike | None = None,
     ) -> Answer:
-        """Return what the policy would have done, and remember nothing, where the recorded one gave `gave`.
+        """Return the policy's action, and remember nothing, at a step where the recorded policy gave `gave`.
 
         That and `last` are leaves `[batch, *shape]`: what the policy sees of its actions is what was given, and what
         limits count from is what the robot did before. Raises what `step` raises.
@@ -312,7 +312,7 @@ class Policy(Closeable):
     def value(self, obs: Observation) -> NDArray[Any] | None:
         """Return the critic's value of each observation `[batch]`; None if the graph has none, or remembers.
 
-        The first call opens the whole graph, of which acting may need a part. Raises what `parse` and `load` raise.
+        The first call opens the whole graph; acting may need only a part. Raises the errors of `parse` and `load`.
         """
         if self.is_stateful or all(tensor.name != VALUE for tensor in self._contract.outputs):
             return None
@@ -343,7 +343,7 @@ class Policy(Closeable):
     def network(self) -> Network:
         """Return the network: from what `parse` gives to the action's tensors by name (`build_action` checks them).
 
-        It is onnxruntime's own `run`: what has been given to it is computed even when the policy is closed meanwhile.
+        It is onnxruntime's own `run`: a running computation ends normally even if the policy is closed meanwhile.
         """
         run: Callable[..., Sequence[Any]] = self._open().run  # an action is dense: no sparse tensors, no maps
         names = list(self._action_checks)
@@ -427,7 +427,7 @@ class Policy(Closeable):
                 f"policy '{self._contract.name}' has no action distribution and cannot explore: leave 'explore' out"
             )
         if not self.options.explore:
-            raise RequestError(f"policy '{self._contract.name}' is not to explore on this server: leave 'explore' out")
+            raise RequestError(f"policy '{self._contract.name}' must not explore on this server: leave 'explore' out")
         return distribution
 
     def _sample(self, inputs: NDArray[Any], seed: int | None) -> dict[str, NDArray[Any]]:
@@ -437,7 +437,7 @@ class Policy(Closeable):
             rng = self._rng = self._rng or np.random.default_rng()
         else:
             rng = np.random.default_rng(seed)
-        # Minus infinity is how a policy says 'not allowed'; where it is a mean, the action is refused.
+        # Minus infinity in a score means 'not allowed'; if it is a mean, the action is refused.
         if np.isnan(inputs).any() or np.isposinf(inputs).any():
             raise ActionError(
                 f"policy '{self._contract.name}' gave a non-finite action distribution for this observation"

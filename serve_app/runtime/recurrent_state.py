@@ -1,6 +1,6 @@
 """Recurrent state as the graph's tensors: network state, frames, previous actions, reward.
 
-Where it is kept is the caller's affair: `Policy` keeps one, a server's clients may send theirs along.
+The caller keeps it: `Policy` keeps one, a server's clients may send theirs along.
 """
 
 from __future__ import annotations
@@ -79,13 +79,13 @@ class StateTensors:
         return found
 
     def _reward(self, starting: bool, rows: int, reward: ArrayLike | None) -> NDArray[np.float32]:
-        if starting and self._specs:  # where nothing else is remembered, an episode's start looks like any step
-            return np.zeros(rows, np.float32)  # nothing has been earned yet, whatever the caller says
+        if starting and self._specs:  # without other memory, an episode's start looks like any step
+            return np.zeros(rows, np.float32)  # no reward yet, whatever the caller sent
         if reward is None:
             start = "" if self._specs else ", 0 at an episode's start"
             raise RequestError(
-                f"policy '{self._policy}' was trained to see the reward of its last action: give "
-                f"act(obs, reward=...), over a network 'reward'{start}"
+                f"policy '{self._policy}' was trained to see the reward of its last action: pass "
+                f"act(obs, reward=...), in a request 'reward'{start}"
             )
         array = parse_array(reward, "float32", f"the reward for policy '{self._policy}'").reshape(-1)
         if len(array) != rows or not np.isfinite(array).all():

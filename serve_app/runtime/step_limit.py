@@ -17,7 +17,7 @@ from rlservo.export.contract.spaces import BoxSpec, LeafSpec
 from rlservo.serve_app.runtime.input_numbers import first_element, parse_array, rounding_slack
 from rlservo.serve_app.runtime.options import PolicyOptions
 
-ROUNDING = 1e-6  # relative to the step: what float32 may add to a step that is allowed
+ROUNDING = 1e-6  # relative to the step: rounding that float32 may add to an allowed step
 
 
 class StepLimit:

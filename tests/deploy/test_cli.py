@@ -153,7 +153,7 @@ def test_verify_measures_disturbances_and_writes_them_into_the_contract(bundle: 
     [
         ((), "give --checkpoint to compare the bundle with, or --env with --disturb or --compiled"),
         (("--disturb",), "--disturb needs --env"),
-        (("latency=2", "--env", "CartPole-v1"), "go with --disturb"),
+        (("latency=2", "--env", "CartPole-v1"), "need --disturb"),
         (("--disturb", "wind=3", "--env", "CartPole-v1"), "'wind=3': expected KIND=SIZE"),
         (
             ("--disturb", "payload=3", "--env", "rlservo/NoObstacleNavigationMir100Sim-v0", "--env-arg", "ur_model=0"),

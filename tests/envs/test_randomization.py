@@ -353,7 +353,7 @@ def test_impossible_disturbances_are_refused(arguments: dict[str, Any], message:
 def test_what_an_environment_cannot_do_is_named(arguments: dict[str, Any], lack: str) -> None:
     with pytest.raises(ValueError, match=lack):
         DomainRandomization(Counter(), **arguments)
-    with pytest.raises(ValueError, match="CartPoleEnv does not state its sensors' \\(sensor_errors\\)"):
+    with pytest.raises(ValueError, match="CartPoleEnv does not state its sensors' errors \\(sensor_errors\\)"):
         DomainRandomization(gym.make("CartPole-v1"), observation_noise="real")
 
 

@@ -55,7 +55,7 @@ def test_crashes_are_survived_by_remaking_the_environment_or_the_runner(name: st
 
 def test_crash_in_the_driver_without_the_flag_ends_the_training_with_its_cause(edges: Any) -> None:
     found = edges[1]["Crashing for good"]
-    assert re.search(r"training failed: .*error.txt, and --resume .* goes on", found["error"])
+    assert re.search(r"training failed: .*error.txt, and --resume .* continues", found["error"])
 
 
 @pytest.mark.parametrize(
@@ -76,4 +76,6 @@ def test_what_learned_nothing_is_not_exported_and_the_cause_is_told(name: str, s
 
 def test_failure_is_printed_when_it_happens(edges: Any) -> None:
     said = edges[1]["Failing"]["said"]
-    assert re.search(r"^failed in sampling, 1 so far: RuntimeError: the gripper is not calibrated", said, re.MULTILINE)
+    assert re.search(
+        r"^failed while sampling, 1 so far: RuntimeError: the gripper is not calibrated", said, re.MULTILINE
+    )

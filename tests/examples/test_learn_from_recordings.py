@@ -152,7 +152,7 @@ def test_q_learners_go_on_from_sac(algorithm: str, one_ray: OneRay, zoo: Path, t
         (("--run", "BC", "--status", "happy"), "no recorded episode can be learned from: 3 that did not end in"),
         (("--run", "BC", "--out", "."), "--out . exists"),
         (("--run", "BC", "--epochs", "0"), "--epochs is 0"),
-        (("--run", "BC", "--set", "num_learners=1"), "--set num_learners: recordings are learned from in this process"),
+        (("--run", "BC", "--set", "num_learners=1"), "--set num_learners: one learner in this process"),
         (("--run", "BC", "--from", "nowhere"), "nowhere does not exist"),
         (("--run", "BC", "--from", str(UR5)), "its actions are Box(-1.0, 1.0, (5,), float32), recorded are Box("),
     ],

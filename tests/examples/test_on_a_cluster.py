@@ -40,7 +40,7 @@ def test_cluster_that_grows_says_what_it_waits_for(runs: dict[str, Any]) -> None
     assert runs["grew"]["said"].count(line) >= 1
     assert runs["grew"]["after_s"] >= 9.0
     assert runs["interrupted"]["code"] == 130
-    assert "stopped; go on with" in runs["interrupted"]["said"]
+    assert "stopped; continue with" in runs["interrupted"]["said"]
 
 
 def test_training_survives_a_node_killed_on_the_way(runs: dict[str, Any], folder: Path) -> None:

@@ -72,4 +72,6 @@ def test_run_that_needs_more_than_this_machine_has_is_not_resumed(script: str, r
     (tmp_path / "run.json").write_text(json.dumps(run | {"request": [{"CPU": 1.0}] * 401, "rest": rest}))
     ended = run_here(f"{script}.py", "--resume", str(tmp_path), home=tmp_path)
     assert ended.code == 2
-    assert re.search(r"40\d CPUs asked for .*; this machine has \d+ CPUs?: go on where there are as many", ended.err)
+    assert re.search(
+        r"40\d CPUs asked for .*; this machine has \d+ CPUs?: resume on a machine that has as many", ended.err
+    )

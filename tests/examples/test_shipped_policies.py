@@ -463,11 +463,11 @@ def test_training_begins_with_another_network_without_the_elements_it_shall_forg
         (
             "train_shipped.py",
             ("mir100_obstacle_avoidance", "--set", "model.free_log_std=false"),
-            "largest_std bounds a standard deviation that is no output: set model.free_log_std=true",
+            "largest_std bounds a standard deviation that is not an output: set model.free_log_std=true",
         ),
         ("evaluate_shipped.py", ("nobody",), "no policy 'nobody' ships: expected some of cartpole_dqn"),
         ("evaluate_shipped.py", ("--episodes", "1"), "--episodes is 1 and --seed 20000: expected at least 2 and 0"),
-        ("evaluate_shipped.py", ("--checkpoint", "x"), "--checkpoint goes with one NAME and without --write"),
+        ("evaluate_shipped.py", ("--checkpoint", "x"), "--checkpoint needs one NAME and no --write"),
     ],
 )
 def test_wrong_argument_is_refused_in_a_sentence(

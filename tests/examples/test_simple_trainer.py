@@ -82,7 +82,9 @@ def test_nothing_is_left_in_the_home_folder_or_beside_the_script(sweep: Any) -> 
 @pytest.mark.slow
 def test_ctrl_c_stops_everything_and_says_how_to_go_on(interrupted: Any) -> None:
     assert interrupted.stopped.code == 130, interrupted.stopped.err
-    assert re.search(r"stopped; go on with: python .*simple_trainer.py --resume .*runs/PPO-", interrupted.stopped.out)
+    assert re.search(
+        r"stopped; continue with: python .*simple_trainer.py --resume .*runs/PPO-", interrupted.stopped.out
+    )
     assert "Traceback" not in interrupted.stopped.err
     assert interrupted.left == []
 
@@ -119,7 +121,7 @@ WRONG: list[tuple[str, str]] = [
     ),
     ("--num-gpus 64", "64 GPUs asked for .*; this machine has .*: leave --num-gpus out"),
     ("--num-gpus-per-env-runner 64", "64 GPUs asked for .*; this machine has"),
-    ("--set custom_resources_per_env_runner={arm:1}", "the resources asked for are none that RLlib understands"),
+    ("--set custom_resources_per_env_runner={arm:1}", "RLlib does not understand the requested resources"),
     ('--set custom_resources_per_env_runner={"arm":1}', "1 arm asked for .*; this machine has 0 arm: ask for"),
     ("--name-env CartPoole-v1", "not registered: did you mean CartPole-v1"),
     ("--env-arg colour=red", "cannot be made with .*colour"),

@@ -35,4 +35,4 @@ def test_every_stop_ends_in_a_bundle(trained: Any) -> None:
 def test_unknown_stop_is_refused_in_a_sentence(tmp_path: Path, run_here: Any) -> None:
     ended = run_here("tour.py", "atari", home=tmp_path)
     assert ended.code == 2
-    assert "atari is no stop of the tour: expected cartpole, frozenlake, ur5" in ended.err
+    assert "atari is not a stop of the tour: expected cartpole, frozenlake, ur5" in ended.err

@@ -127,7 +127,7 @@ def test_killed_robot_server_is_noticed_and_its_client_gets_an_error(
             get_state(port)
     assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
     assert wait_for(lambda: port not in manager.servers.running, 2.0)
-    assert wait_for(lambda: "ended by itself: killed by SIGKILL" in caplog.text, 2.0)
+    assert wait_for(lambda: "exited unexpectedly: killed by SIGKILL" in caplog.text, 2.0)
     assert not is_alive(pid)  # and no zombie is left
     assert get_state(other).success
     # robo-gym's ExceptionHandling wrapper kills the server it lost before it starts another.

@@ -53,5 +53,5 @@ def test_what_cannot_be_picked_is_said_with_what_there_is(tmp_path: Path) -> Non
     with pytest.raises(CheckpointError, match="is not a Tune trial or experiment"):
         best_checkpoint(tmp_path, METRIC, notify=print)
     write_trial(tmp_path / "a", [1.0])
-    with pytest.raises(CheckpointError, match=f"reported with its checkpoints were {METRIC}"):
+    with pytest.raises(CheckpointError, match=f"its checkpoints report {METRIC}"):
         best_checkpoint(tmp_path, "episode_return_mean", notify=print)

@@ -72,7 +72,7 @@ def test_a_filter_whose_statistics_were_not_saved_is_refused(
 ) -> None:
     damaged = copy_of("pendulum")
     shutil.rmtree(damaged / "env_runner")
-    with pytest.raises(CheckpointError, match="the observation filter's statistics are of 0 observations"):
+    with pytest.raises(CheckpointError, match="the observation filter's statistics come from 0 observations"):
         export_checkpoint(damaged, tmp_path / "out", app_dir=app.parent, notify=notices.append)
     (damaged / "class_and_ctor_args.pkl").unlink()
     with pytest.raises(CheckpointError, match="it has neither env_runner/"):

@@ -167,7 +167,7 @@ def test_angles_become_sines_in_their_place_and_cosines_at_the_end() -> None:
 
 def test_images_are_not_stacked_as_vectors() -> None:
     image = gymnasium.spaces.Box(0.0, 1.0, (8, 8, 1))
-    with pytest.raises(UsageError, match=r"frames are stacked of vectors; RLlib's FrameStacking has images"):
+    with pytest.raises(UsageError, match=r"only frames of vectors are stacked here; RLlib's FrameStacking stacks"):
         batched_connectors.FrameStacking(image, gymnasium.spaces.Discrete(2), num_frames=2)
 
 

@@ -70,8 +70,8 @@ def test_every_module_finds_its_agents_statistics_at_the_root(
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("never_merged", r"are of 0 observations: RLlib divides .*; training took 128 environment steps"),
-        ("imitation", r"are of \d+ observations in evaluation, and of none in training; "),
+        ("never_merged", r"come from 0 observations: RLlib divides .*; training took 128 environment steps"),
+        ("imitation", r"come from \d+ observations in evaluation and none in training; "),
     ],
 )
 def test_statistics_that_are_not_trainings_are_exported_only_where_asked_for(

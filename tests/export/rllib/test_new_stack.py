@@ -100,7 +100,7 @@ def test_graphs_and_runtime_act_as_rllib_did_in_its_own_rollout(
     ("name", "error", "words"),
     [
         ("wrongly_scaled", ParityError, r"a batch of 257 likely observations: output 'action"),
-        ("branching", ParityError, r"another when it is alone: the network's result depends on the other"),
+        ("branching", ParityError, r"changes when it is computed alone: the network's result depends on the other"),
     ],
 )
 def test_what_does_not_match_leaves_nothing(

@@ -327,7 +327,11 @@ def test_the_old_stack_reference_does_not_drift(load: Callable[..., RestoredPoli
         ("attention", UnsupportedError, r"AttentionWrapper of policy PPOTorchPolicy .*\('state_in_0', shift -50:-1\)"),
         ("previous_lstm", UnsupportedError, r"LSTMWrapper of policy PPOTorchPolicy .*\('prev_actions', shift -1\)"),
         ("noisy_dqn", UnsupportedError, r"noisy layers \(noisy=True\)"),
-        ("noisy_weights", UnsupportedError, "explores with ParameterNoise, and RLlib saves its weights with the noise"),
+        (
+            "noisy_weights",
+            UnsupportedError,
+            "explores with ParameterNoise, and RLlib saves its weights with that moment's noise",
+        ),
         (
             "previous_action",
             UnsupportedError,
@@ -441,7 +445,7 @@ def filter_of(state: dict[str, Any]) -> dict[str, Any]:
         (
             lambda state: filter_of(state)["running_stats"][0].pop("sum_sq_diff_array"),
             UnsupportedError,
-            "the observation filter's statistics are in a form that is not known",
+            "the observation filter's statistics are in an unknown form",
         ),
         (
             lambda state: filter_of(state)["running_stats"][0].update(mean_array="eJyb"),

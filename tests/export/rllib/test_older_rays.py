@@ -107,7 +107,7 @@ def test_connectors_that_the_configuration_does_not_give_are_refused(
 ) -> None:
     checkpoint = older_copy("2.33.0/ppo_new")
     (checkpoint / "env_runner/env_to_module_connector/AgentToModuleMapping").mkdir()
-    with pytest.raises(UnsupportedError, match=r"holds the connectors .*AgentToModuleMapping.* did not save what"):
+    with pytest.raises(UnsupportedError, match=r"holds the connectors .*AgentToModuleMapping.* did not save their"):
         export_checkpoint(checkpoint, tmp_path / "out", app_dir=OLDER_RAYS, notify=notices.append)
 
 

@@ -56,7 +56,7 @@ def test_a_package_that_cannot_be_imported_stops_no_other_source(
 
 def test_a_path_that_no_source_knows_lists_what_each_expects(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(CheckpointError, match=r"is not a checkpoint that any source knows: rllib: .*; sb3: the zip"):
+    with pytest.raises(CheckpointError, match=r"is not a checkpoint of any known source: rllib: .*; sb3: the zip"):
         find_source(tmp_path / "notes.txt")
     with pytest.raises(CheckpointError, match="nothing does not exist: expected a checkpoint"):
         find_source(tmp_path / "nothing")
@@ -66,7 +66,7 @@ def test_a_path_that_no_source_knows_lists_what_each_expects(tmp_path: Path) -> 
 
 def test_a_source_that_is_named_says_what_it_wants(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(CheckpointError, match="is no model of Stable-Baselines3: expected the zip"):
+    with pytest.raises(CheckpointError, match="is not a model of Stable-Baselines3: expected the zip"):
         export_checkpoint(tmp_path / "notes.txt", tmp_path / "out", source="sb3")
     with pytest.raises(CheckpointError, match="is a file: expected the folder of an RLlib checkpoint"):
         export_checkpoint(tmp_path / "notes.txt", tmp_path / "out", source="rllib")

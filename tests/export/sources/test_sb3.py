@@ -262,7 +262,7 @@ class TestBroken:
     def test_statistics_of_other_observations(self, model: Path) -> None:
         vec, _ = normalized(OPEN, BOX)
         vec.save(model.with_name("vecnormalize.pkl"))
-        self.refused(model, r"statistics are of observations \(3,\), the model's are \(4,\): they do not belong")
+        self.refused(model, r"statistics are for observations \(3,\), the model's are \(4,\): they do not belong")
 
     def test_statistics_that_are_none(self, model: Path) -> None:
         model.with_name("vecnormalize.pkl").write_bytes(pickle.dumps({"mean": 0}))
@@ -272,7 +272,7 @@ class TestBroken:
 
     def test_statistics_of_no_observation(self, model: Path) -> None:
         VecNormalize(DummyVecEnv([lambda: Spaces(VECTOR, BOX)])).save(model.with_name("vecnormalize.pkl"))
-        self.refused(model, "VecNormalize's statistics are of 0 observations")
+        self.refused(model, "VecNormalize's statistics come from 0 observations")
 
     def test_a_policy_class_that_cannot_be_imported(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, notices: list[str]
@@ -302,7 +302,7 @@ class TestBroken:
         self.refused(tmp_path / "model.zip", "'action_net.weight' are not all finite: training diverged")
 
     def test_frames_that_do_not_divide_the_observation(self, model: Path) -> None:
-        self.refused(model, "is no stack of 3 frames", frame_stack=3)
+        self.refused(model, "is not a stack of 3 frames", frame_stack=3)
 
     def test_actions_that_are_whole_numbers(self, tmp_path: Path) -> None:
         make(sb3.PPO, "MlpPolicy", VECTOR, spaces.Box(0, 5, (2,), np.int32)).save(tmp_path / "model")

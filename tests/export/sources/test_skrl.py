@@ -115,7 +115,7 @@ def test_runs_that_cannot_be_read_are_refused_with_the_reason(tmp_path: Path, no
     clipping = config()
     clipping["models"]["policy"]["clip_mean_actions"] = True
     file.write_text(yaml.dump(clipping))
-    refused("clips to the action space, whose bounds no file of the run says", UnsupportedError)
+    refused("clips to the action space, whose bounds are in no file of the run", UnsupportedError)
     other = config()
     other["models"]["policy"]["network"][0]["layers"] = [9]
     file.write_text(yaml.dump(other))

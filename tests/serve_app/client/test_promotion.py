@@ -726,7 +726,10 @@ def test_other_terms_do_not_go_on_with_it_and_a_second_process_waits_for_the_fir
     with pytest.raises(UsageError, match="cannot be read"):
         promotion()
     promotion.log.write_text(whole)
-    with PromotionLog.open(promotion.log), pytest.raises(UsageError, match="another 'rlservo policy promote' writes"):
+    with (
+        PromotionLog.open(promotion.log),
+        pytest.raises(UsageError, match="another 'rlservo policy promote' is writing"),
+    ):
         promotion()
     assert server.plan.canary is not None
 

@@ -123,7 +123,7 @@ def test_robots_train_versions_that_reach_them_by_the_alias(cell: Cell) -> None:
     assert cell.acted[0] == "2" and "3" in cell.acted and cell.acted[-1] == "4"
     graphs = {(cell.folder / "policies/policy" / v / "policy.onnx").read_bytes() for v in (first, second, third)}
     assert len(graphs) == 3  # it did learn
-    assert "learning goes on" not in "".join(cell.said)
+    assert "learning continues" not in "".join(cell.said)
 
 
 def test_poisoned_episodes_teach_nothing_and_stop_nothing(cell: Cell) -> None:
@@ -180,13 +180,13 @@ def test_a_version_that_the_gate_refuses_reaches_no_robot(cell: Cell) -> None:
         cell.learning(run, BrokenOnce(cell.checkpoint, batch_size=BATCH)).run(versions=1)
         assert run.state.refused == 1 and [known.version for known in run.state.versions] == ["2", "3"]
     refusals = [line for line in cell.said if "the gate refused it" in line]
-    assert len(refusals) == 1 and "learning goes on from version 2" in cell.said
+    assert len(refusals) == 1 and "learning continues from version 2" in cell.said
     assert set(cell.acted) == {"2"} and cell.aliases()["learning"] == "3"
 
 
 def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
     with cell.run_folder() as run:
-        with pytest.raises(UsageError, match="another process learns in it"):
+        with pytest.raises(UsageError, match="another process is learning in it"):
             cell.run_folder()
 
         def play_and_move(_seconds: float) -> None:
@@ -195,7 +195,7 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
             with cell.admin() as client:
                 client.alias("policy", "learning", "1")
 
-        with pytest.raises(ConflictError, match="leads to version 1, and this run has let it lead to 2"):
+        with pytest.raises(ConflictError, match="points to version 1, but this run had moved it to 2"):
             cell.learning(run, sleep=play_and_move).run(versions=1)
     assert cell.aliases()["learning"] == "1"
 

@@ -162,7 +162,7 @@ def test_what_is_no_disturbance_is_refused_in_one_sentence(text: str, message: s
     ("text", "lack"),
     [
         ("payload=1", "'payload=1': payload is (1.0, 1.0): Track has no simulation that carries one"),
-        ("noise=real", "Track does not state its sensors' (sensor_errors)"),
+        ("noise=real", "Track does not state its sensors' errors (sensor_errors)"),
         ("noise.z=1", "observation_noise names z: expected some of x, speed"),
         ("model=0.1", "no simulation with draw_model_error"),
         ("target=outside", "no extreme_options"),

@@ -275,7 +275,7 @@ def test_a_graph_that_does_not_come_to_an_end_is_given_up_and_computes_no_furthe
     bundle_files.write_contract(folder, read_contract(folder))  # with the hashes of what is there now
     done = subprocess.run([sys.executable, "-c", LOOP, folder], capture_output=True, text=True, timeout=120)
     sentence, busy = done.stdout.splitlines()
-    assert "did not come to an end within 0.5 s" in sentence, done.stderr
+    assert "did not finish its golden vectors within 0.5 s" in sentence, done.stderr
     assert float(busy) < 0.5 and not done.stderr
 
 

@@ -333,9 +333,7 @@ def test_a_graph_that_takes_one_observation_at_a_time_is_refused(bounded: Path, 
     write_golden(folder, {k: v[:1] for k, v in inputs.items()}, {k: v[:1] for k, v in outputs.items()})
     write_contract(folder, load_bundle(bounded).contract)  # the hashes, anew
     assert Policy.load(folder).act(OBS[0]).shape == (6,)
-    with pytest.raises(
-        BundleError, match=r"does not compute three observations as it computes each .*leave micro_batch"
-    ):
+    with pytest.raises(BundleError, match=r"computes three observations together differently .*leave micro_batch"):
         load_policy(folder, options=TOGETHER)
 
 
