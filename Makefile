@@ -5,14 +5,14 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP_QUIET := $(if $(MAKE_TERMOUT),,-qq)
 
-# Unit tests: what starts no Ray, simulator, robot server, proxy or storage, opens no browser, trains nothing, does not
-# wait for time to pass.
+# Unit tests: those that start no Ray, simulator, robot server, proxy or storage, open no browser, train nothing and do
+# not wait for time to pass.
 UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
 	tests/test_layout.py tests/test_package.py tests/test_private_names.py
 NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py replay \
 	repository/test_remote_repository.py)
 
-# Of the extras, those that need no gigabytes; the cockpit's viser holds websockets and rich back.
+# The extras without gigabytes; the cockpit's viser limits websockets and rich to old releases.
 ENDS_EXTRAS := client,serve,sim,record,remote
 TEST_TOOLS := 'pytest>=8' pytest-timeout pytest-xdist pytest-random-order httpx pyyaml jsonschema playwright \
 	'moto[server]' onnx matplotlib
@@ -35,7 +35,7 @@ newest oldest:  ## Unit tests with the newest, or the oldest, release of every d
 		-e '.[$(ENDS_EXTRAS)]'
 	.$@/bin/uv pip freeze --python .$@/bin/python --exclude-editable > .$@/installed.txt
 	.$@/bin/uv pip install --python .$@/bin/python -c .$@/installed.txt $(TEST_TOOLS)
-	# An old release beside a new one of what it needs itself warns of names that will go.
+	# An old release with a new dependency warns of deprecated names.
 	PYTEST_ADDOPTS="-p no:anyio $(if $(filter oldest,$@),-W ignore::DeprecationWarning)" \
 		$(MAKE) --old-file=setup quick VENV=.$@
 
@@ -68,10 +68,10 @@ release: setup  ## Wheel and sdist into dist/, checked, and each installed and r
 
 setup: $(if $(filter file,$(origin PYTHON)),,python) $(STAMP)  ## Only the set-up
 
-python:  # where one was named
+python:  # if one was named
 	$(PYTHON) .ci/check_python.py $(VENV)
 
-# pip's own lines and bars on a terminal; elsewhere errors alone.
+# pip's own output on a terminal; elsewhere only errors.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) .ci/check_python.py $(VENV)
 	$(PYTHON) -m venv $(VENV)
@@ -80,5 +80,5 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt -e '.[all,dev,docs]'
 	touch $(STAMP)
 
-clean:  ## Remove what the other targets made, .venv included
+clean:  ## Remove the other targets' output, .venv included
 	rm -rf $(VENV) .newest .oldest typings demo bench build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,4 +1,4 @@
-"""Trial of what a release uploads: each file in a folder is installed into an empty environment and run.
+"""Trial of a release's files: each is installed into an empty environment and run.
 
 `python .ci/try_release.py dist` exports a shipped checkpoint and asks a server for an action, with wheel and
 sdist. It takes some minutes: each environment gets PyTorch and RLlib.
@@ -42,7 +42,7 @@ def action(url: str, server: subprocess.Popen[bytes]) -> list[float]:
 
 
 def try_out(artifact: Path) -> None:
-    """Install a wheel or an sdist, export, serve, ask. Raises where one of these fails."""
+    """Install a wheel or an sdist, export, serve, ask. Raises if one of these fails."""
     with tempfile.TemporaryDirectory(prefix="rlservo-release-") as name:
         folder = Path(name)
         run(folder, sys.executable, "-m", "venv", "venv")

@@ -1,1 +1,1 @@
-"""Putting the parts together: the command line, the demo, and the files that deploy a server."""
+"""Applications: the command line, the demo, the cockpit, and the files that deploy a server."""

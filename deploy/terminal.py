@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 ESCAPES = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
-"""Control characters, which a bundle's or a policy's names may hold, as they are shown."""
+"""Visible forms of control characters, which a bundle's or a policy's names may hold."""
 
 
 def _console(*, stderr: bool, width: int | None = None) -> Console:
@@ -59,7 +59,7 @@ def errors() -> Console:
 
 @contextmanager
 def status(text: str) -> Iterator[Callable[[str], None]]:
-    """Show what is being done until it is done; gives the function that replaces the text.
+    """Show the current activity until it ends; gives the function that replaces the text.
 
     On a terminal a line that moves; elsewhere a line when nothing else was said for 10 s, 20 s, 40 s ...
     """
@@ -92,7 +92,7 @@ def status(text: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def ends_like_ctrl_c() -> Iterator[None]:
-    """Let SIGTERM and a closed terminal interrupt what runs inside too, as Ctrl-C does."""
+    """Let SIGTERM and a closed terminal interrupt the code inside, as Ctrl-C does."""
 
     def interrupt(_number: int, _frame: object) -> None:
         raise KeyboardInterrupt

@@ -42,11 +42,11 @@ class InvalidActionError(ValueError):
 
 
 class InvalidResetError(ValueError):
-    """A reset option cannot be honoured."""
+    """A reset option is not possible."""
 
 
 def check_action(action: ArrayLike, space: gym.spaces.Box, elements: Sequence[ElementInfo]) -> NDArray[np.float32]:
-    """Return the action as float32, or raise InvalidActionError naming the element and by how much it is out."""
+    """Return the action as float32, or raise InvalidActionError naming the element and its excess."""
     try:
         array = np.asarray(action, dtype=np.float32)
     except (TypeError, ValueError) as error:

@@ -31,7 +31,7 @@ class HasRobotModels(Protocol):
     """An environment whose robot can be replaced by another of the same kind."""
 
     def set_robot_model(self, name: str) -> None:
-        """Exchange the robot; `reset` is next. Raises ValueError for a model that does not exist."""
+        """Exchange the robot; call `reset` next. Raises ValueError for a model that does not exist."""
         ...
 
 
@@ -49,7 +49,7 @@ class HasModelError(Protocol):
 
 @runtime_checkable
 class HasBaseOffset(Protocol):
-    """An environment whose robot may stand elsewhere than it believes."""
+    """An environment whose robot may be displaced without knowing it."""
 
     def set_base_offset(self, offset: tuple[float, float]) -> None:
         """Give the policy positions of objects that are wrong by `offset` (x, y) [m], until the next call."""

@@ -1,4 +1,4 @@
-"""OpenGL contexts for pictures off screen, with or without a display, and the test whether a window can open."""
+"""OpenGL contexts for off-screen pictures, with or without a display, and a test whether a window can open."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class CannotDrawError(RuntimeError):
 
 
 def has_display() -> bool:
-    """Try to open a window, an invisible one. MuJoCo ends or aborts the whole process if it cannot."""
+    """Try to open an invisible window. MuJoCo ends or aborts the whole process if it cannot."""
     if not sys.platform.startswith("linux"):
         return True
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):

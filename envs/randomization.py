@@ -43,7 +43,7 @@ EXTREMES: tuple[Extreme, ...] = ("target", "start")
 
 
 class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
-    """Delay and lose what is sent, disturb what is observed, and let the robot differ from its model.
+    """Delay and drop messages, disturb observations, and let the robot differ from its model.
 
     | argument | what is drawn | drawn at | unit |
     |---|---|---|---|
@@ -140,7 +140,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         self._stuck: tuple[int, float] | None = None  # an element's index and the value it keeps
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Draw what is drawn once an episode, and start it."""
+        """Draw the episode's values, and start it."""
         if seed is not None:
             # Not the environment's own stream: its episodes stay what they are without this wrapper.
             self._rng = np.random.default_rng([seed, 1])
@@ -176,7 +176,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         return first, {**info, "randomization": draws}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Give the environment the action of some cycles ago, and return what is seen by now."""
+        """Give the environment the action of some cycles ago, and return the newest observation that has arrived."""
         if self._delay:
             action = copy.deepcopy(action)  # the caller may write into it before it takes effect
         if not self._actions:
@@ -221,7 +221,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     # -- each step
 
     def _sensed(self, observation: Any) -> Any:
-        """Return the observation as the sensors give it."""
+        """Return the observation with the sensors' errors."""
         if self._noise is None and self._constant_error is None and self._stuck is None:
             return observation
         sensed: Vector = np.asarray(observation, dtype=np.float64)
@@ -387,7 +387,7 @@ def wrapped_env(env_id: str, env_config: Mapping[str, Any]) -> tuple[str, dict[s
 
 
 def _describe(**env_config: Any) -> Any:
-    """Name the elements of the environment that is wrapped."""
+    """Name the elements of the wrapped environment."""
     entry_point = gym.spec(plain_id(env_config["env_id"])).entry_point
     made_by = pkgutil.resolve_name(entry_point) if isinstance(entry_point, str) else entry_point
     describe = getattr(made_by, "describe", None)

@@ -1,4 +1,4 @@
-"""Pictures of a simulator: `rgb_array` frames off screen, `human` in MuJoCo's viewer, and what other viewers need."""
+"""Pictures of a simulator: `rgb_array` frames, `human` in MuJoCo's viewer, and the interface of other viewers."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return None
 
     def move_target(self, position: ArrayLike) -> None:
-        """Put the target somewhere else within the episode. Raises ValueError for a task without one."""
+        """Move the target within the episode. Raises ValueError for a task without one."""
         raise ValueError(f"{type(self).__name__} has no target to move to {np.asarray(position).tolist()}")
 
     def obstacle_positions(self) -> Vector:
@@ -72,7 +72,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
         return np.zeros((0, 3))
 
     def move_obstacle(self, index: int, position: ArrayLike) -> None:
-        """Put an obstacle somewhere else within the episode. Raises ValueError if there is none of that number."""
+        """Move an obstacle within the episode. Raises ValueError if it does not exist."""
         raise ValueError(f"{type(self).__name__} has no obstacle {index} to move to {np.asarray(position).tolist()}")
 
     def viewpoint(self) -> tuple[Vector, Vector]:
@@ -96,7 +96,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     @abstractmethod
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
-        """Put robot and target where row `row` of an episode's observations (n, size) has them: to look at, not to act.
+        """Show robot and target as in row `row` of an episode's observations (n, size): to look at, not to act.
 
         Anything that the observations do not contain keeps a new environment's value.
         """
@@ -178,7 +178,7 @@ class Camera:
 
 
 class _Picture:
-    """Off-screen buffer of one camera. `mujoco.Renderer` could not: it takes no OpenGL context of our choice."""
+    """Off-screen buffer of one camera. `mujoco.Renderer` could not: it does not take our OpenGL context."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         self._model = model

@@ -43,7 +43,7 @@ class Poses:
     wxyz: Vector  # (n, 4)
 
     def towards(self, other: Poses, share: float) -> Poses:
-        """Return the poses a share (0 .. 1) of the way to `other`; quaternions along the chord."""
+        """Return poses interpolated by a share (0 .. 1) towards `other`; quaternions along the chord."""
         nearer = np.where((self.wxyz * other.wxyz).sum(axis=1, keepdims=True) < 0.0, -other.wxyz, other.wxyz)
         wxyz = self.wxyz + share * (nearer - self.wxyz)
         positions = self.positions + share * (other.positions - self.positions)
@@ -51,7 +51,7 @@ class Poses:
 
 
 def visible_shapes(model: mujoco.MjModel) -> list[Shape]:
-    """Return what a viewer shows of a model; kinds of geoms that our models do not have are left out."""
+    """Return a model's visible shapes; kinds of geoms that our models do not have are left out."""
     return [
         _shape(model, geom)
         for geom in range(model.ngeom)
@@ -60,12 +60,12 @@ def visible_shapes(model: mujoco.MjModel) -> list[Shape]:
 
 
 def moving_bodies(model: mujoco.MjModel) -> list[int]:
-    """Return the bodies that are not fixed to the world: those behind a joint, and those that are put somewhere."""
+    """Return the bodies that are not fixed to the world: those behind a joint, and those that are placed."""
     return [body for body in range(model.nbody) if model.body_weldid[body] != 0 or model.body_mocapid[body] >= 0]
 
 
 def body_poses(data: mujoco.MjData, bodies: list[int]) -> Poses:
-    """Return a copy of where bodies are."""
+    """Return a copy of the bodies' poses."""
     return Poses(data.xpos[bodies].copy(), data.xquat[bodies].copy())
 
 

@@ -81,7 +81,7 @@ class Tab:
         self.call("Page.addScriptToEvaluateOnNewDocument", source=source)
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of an expression of JavaScript, awaited where it is a promise."""
+        """Return the value of an expression of JavaScript, awaited if it is a promise."""
         done = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in done, (expression, done)
         return done["result"].get("value")
@@ -164,7 +164,7 @@ class Browser:
 
 
 def browser_program() -> str:
-    """Return where Chromium or Chrome is; skip the test where there is none."""
+    """Return the path of Chromium or Chrome; skip the test if there is none."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
         pytest.skip("no Chromium or Chrome is installed: no page was opened")
@@ -187,7 +187,7 @@ def browser() -> Iterator[Browser]:
 
 @contextlib.contextmanager
 def browsing() -> Iterator[Browser]:
-    """Start a browser that reaches nothing but this machine, and end it; skip the test where there is none."""
+    """Start a browser that reaches nothing but this machine, and end it; skip the test if there is none."""
     program = browser_program()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         port_file, log = Path(folder, "DevToolsActivePort"), Path(folder, "log")

@@ -314,7 +314,7 @@ def ur5(policies: Path) -> Path:
 
 @pytest.fixture
 def rewrite_contract() -> Callable[..., None]:
-    """Change fields of a bundle's contract and record the hashes anew: tampering that hashes cannot see."""
+    """Change fields of a bundle's contract and record the hashes again: tampering that hashes cannot see."""
 
     def rewrite(folder: Path, **changes: Any) -> None:
         contract = bundle_files.read_contract(folder).model_copy(update=changes)

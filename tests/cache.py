@@ -1,6 +1,6 @@
 """Folders that cost much to make, kept in the user's cache between runs and shared by the processes of one run.
 
-Each is named after what makes it, so that a change there makes it anew.
+Each is named after what makes it, so that a change there makes it again.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ PYTHON = f"python{sys.version_info[0]}.{sys.version_info[1]}"
 
 
 def cached(name: str, made_of: Iterable[Path | str], make: Callable[[Path], None]) -> Path:
-    """Return a folder that `make` has filled, in this run or an earlier one. Whoever changes files in it copies first.
+    """Return a folder that `make` has filled, in this run or an earlier one. Callers that change files copy first.
 
-    `made_of` tells one content from another: files and folders (by what is in them) and words such as versions.
+    `made_of` identifies the content: files and folders (by what is in them) and words such as versions.
     """
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rlservo-tests"
     root.mkdir(parents=True, exist_ok=True)
@@ -53,7 +53,7 @@ def _version(package: str) -> str:
 
 
 def digest(made_of: Iterable[Path | str]) -> str:
-    """Return a word that tells files, folders and words with another content from these."""
+    """Return a word that identifies the content of files, folders and words."""
     found = hashlib.sha256()
     for part in made_of:
         if isinstance(part, str):

@@ -23,7 +23,7 @@ TRAINED_WITH = [ZOO, CONNECTORS, versions("ray", "torch", "gymnasium", "numpy")]
 
 
 def training_code() -> Path:
-    """Return where the training scripts run: a copy that is there as long as their checkpoints, which name its files.
+    """Return the folder where the training scripts run: a copy that lives as long as their checkpoints.
 
     So any checkout with the same code has the same checkpoints, and may go.
     """

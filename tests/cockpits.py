@@ -92,7 +92,7 @@ class Browser:
         mouse.up()
 
     def click(self, name: str, *, role: str = "button") -> None:
-        """Click what has this name, also where the browser draws too few pictures for it to be seen standing still."""
+        """Click what has this name, even if the browser draws too few pictures for Playwright to see it stable."""
         from playwright.sync_api import TimeoutError as NotInTimeError
 
         named = self.page.get_by_role(role, name=name, exact=True).first
@@ -102,7 +102,7 @@ class Browser:
             named.click(force=True)
 
     def choose(self, label: str, option: str | None) -> None:
-        """Choose an option of a dropdown, by its name or the second one there is; again where the list has closed."""
+        """Choose an option of a dropdown, by its name or the second one there is; again if the list has closed."""
         from playwright.sync_api import TimeoutError as NotInTimeError
 
         options = self.page.get_by_role("option")
@@ -161,7 +161,7 @@ def served_on(app: Any, port: int) -> Iterator[None]:
 
 @pytest.fixture
 def free_port() -> int:
-    """A port that nobody has."""
+    """A free port."""
     return free_ports(1)[0]
 
 
@@ -181,7 +181,7 @@ Windows = Callable[[int, int], Browser]
 
 @pytest.fixture(scope="module")
 def windows(chromium: Any) -> Windows:
-    """Open a window of a size. Whoever opens one closes it."""
+    """Open a window of a size. The caller closes it."""
 
     def make(width: int, height: int) -> Browser:
         context = chromium.new_context(viewport={"width": width, "height": height})

@@ -1,6 +1,6 @@
 """The command line `rlservo` for tests: in a process of its own, or in this one.
 
-A process takes half a second of processor time to start, and ten times that where it imports RLlib: one of its own is
+A process takes half a second of processor time to start, and ten times that if it imports RLlib: one of its own is
 for what a process does, and once for each kind of command.
 """
 

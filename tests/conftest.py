@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-# Where PYTHONDONTWRITEBYTECODE is set, each of this suite's hundreds of processes would compile rlservo's modules anew,
-# and each of pytest's all test files.
+# Where PYTHONDONTWRITEBYTECODE is set, each of this suite's hundreds of processes would compile rlservo's modules
+# again, and each of pytest's all test files.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
@@ -63,7 +63,7 @@ TOGETHER = {
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
-# What takes longest begins first, and what mostly waits early, beside what computes: nobody waits for it in the end.
+# The longest files begin first, and those that mostly wait early, next to those that compute: none is left for the end.
 # The files with slow tests follow, then the rest.
 LONGEST = (
     "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
@@ -79,7 +79,7 @@ LONGEST = (
     "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_api_key_file.py",
 )  # fmt: skip
 
-# Servers and Rays that tests share. One that nobody uses still takes a tenth of a core or more.
+# Servers and Rays that tests share. An unused one still takes a tenth of a core or more.
 RUNNING = {"live_server", "shipped_server", "cluster", "one_ray"}
 
 

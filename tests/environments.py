@@ -58,7 +58,7 @@ def image_environment(wheel: Path, tmp_path: Path) -> Path:
 def environment_with(wheel: Path, folder: Path, *extras: str) -> Path:
     """Make a virtual environment of the wheel and what these extras require, nothing else.
 
-    Linked to the packages that are installed here, file by file, so that it costs no download. Made anew each time, in
+    Linked to the packages that are installed here, file by file, so that it costs no download. Made again each time, in
     a second: one that is kept may outlive the packages that it links to.
     """
     venv.create(folder)
@@ -160,10 +160,10 @@ def client_environment() -> Callable[..., Path]:
 def robo_gym_python() -> Path:
     """Return the Python of an environment with robo-gym, and without Ray, MuJoCo and rlservo.
 
-    robo-gym pins a protobuf that Ray cannot use. Python 3.10, where there is one, is the last to have that compiled:
+    robo-gym pins a protobuf that Ray cannot use. Python 3.10, if there is one, is the last to have that compiled:
     otherwise a client spends a third of its time reading a laser's 500 numbers a step.
 
-    Where the environment cannot be built (no network, say) these tests skip with the reason, unless
+    If the environment cannot be built (without a network, for example) these tests skip with the reason, unless
     RLSERVO_REQUIRE_ROBO_GYM is set, as it is in CI.
     """
     try:

@@ -21,7 +21,7 @@ PATIENCE_S = 120  # [s] on a busy machine
 
 @dataclass
 class Load:
-    """Clients of one policy, which ask again at once where a connection breaks."""
+    """Clients of one policy, which ask again at once if a connection breaks."""
 
     port: int
     policy: str

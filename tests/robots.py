@@ -142,7 +142,7 @@ class GrpcConnection:
 
 @dataclass
 class Tally:
-    """What came of the robots' requests."""
+    """Outcome of the robots' requests."""
 
     answered: int = 0
     given_up: int = 0
@@ -170,7 +170,7 @@ class Robot:
 
     async def play(self) -> None:
         while self.tally.answered < self.answers and not self.tally.wrong:
-            # Where the memory may be: (steps, state). Several where steps were given up.
+            # The possible memories: (steps, state). Several if steps were given up.
             self._places: list[tuple[int, State | None]] = [(0, None)]
             length = self._draw.randrange(2, 20)
             for step in range(length):
@@ -180,7 +180,7 @@ class Robot:
         await self.connection.close()
 
     async def _step(self, *, begins: bool, ends: bool) -> bool:
-        """Take a step; return whether the episode goes on."""
+        """Take a step; return whether the episode continues."""
         obs = self._rng.uniform(-1, 1, 3).astype(np.float32)
         steps = [(count, self.policy.step(obs, before=state)) for count, state in self._places]
         given_up_after_s = self._draw.choice([0.0015, 0.005, 0.02]) if self._draw.random() < 0.1 else LONG_S

@@ -256,7 +256,7 @@ def launched(
     prefix: tuple[str, ...] = (),
     **environment: str,
 ) -> Iterator[Run]:
-    """Start `serve_policies` in processes of its own. Whoever calls ends it, or whatever is left of it is killed."""
+    """Start `serve_policies` in processes of its own. The caller ends it, or its remains are killed."""
     port, grpc_port = free_ports(2)
     with tempfile.TemporaryDirectory() as keys:
         key_file = Path(keys, "admin.key") if with_admin_key else None
@@ -357,7 +357,7 @@ class Reply(NamedTuple):
 
 
 def exchange(port: int, method: str, path: str, body: Any = None, **headers: str) -> Reply:
-    """Send one request on a connection of its own; a body that is no bytes is sent as JSON."""
+    """Send one request on a connection of its own; a body that is not bytes is sent as JSON."""
     content = body if body is None or isinstance(body, bytes) else json.dumps(body)
     sent = {"content-type": "application/json"} | {name.replace("_", "-"): value for name, value in headers.items()}
     with contextlib.closing(http.client.HTTPConnection("127.0.0.1", port, timeout=30)) as connection:

@@ -62,7 +62,7 @@ class Storage:
         self.proxy.lie = lambda *_: None
 
     def gets(self, end: str) -> int:
-        """How often an object whose name ends so was read."""
+        """Number of reads of an object whose name ends so."""
         return sum(line.startswith("GET ") and line.endswith(end) for line in self.proxy.requests)
 
     def make(self, bucket: str) -> None:
@@ -70,7 +70,7 @@ class Storage:
         _make_bucket(self.proxy.upstream, bucket)
 
     def change(self, method: str, name: str, content: bytes = b"") -> None:
-        """Write or delete an object behind everybody's back."""
+        """Write or delete an object without the server's knowledge."""
         path = self.uri.removeprefix("s3:/") + "/" + name
         assert _ask(self.proxy.upstream, method, path, {"authorization": SIGNED}, content)[0] < 300
 
@@ -149,7 +149,7 @@ def moto() -> Iterator[int]:
     """The port of an S3."""
     from botocore.loaders import JSONFileLoader
 
-    # Each test's client would parse S3's own description of itself anew, megabytes of it: a third of what they take.
+    # Each test's client would parse S3's own description again, megabytes of it: a third of their time.
     patch = pytest.MonkeyPatch()
     load = functools.cache(functools.partial(JSONFileLoader.load_file, JSONFileLoader()))
     patch.setattr(JSONFileLoader, "load_file", lambda _, path: load(path))

@@ -37,7 +37,7 @@ def documents() -> list[Path]:
 
 
 def written() -> list[Path]:
-    """Return the documents that somebody reads and wrote: without the policies' cards and measurements."""
+    """Return the hand-written documents, without the policies' cards and measurements."""
     others = [path for path in documents() if not {CARDS, RESULTS} & {*path.parents}]
     return [path for path in others if GENERATED not in path.read_text(encoding="utf-8")]
 

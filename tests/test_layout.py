@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("envs", "export", "serve_app", "deploy")
 WHOLE = ("envs", "deploy")  # one part each, with their subfolders
 
-# What a folder may import beside itself. Each stands below those that name it, so no two can import each other.
+# Imports that a folder may have besides its own. Each is below those that name it, so no two can import each other.
 MAY_IMPORT: dict[str, set[str]] = {
     "export/contract": set(),
     "export/checkpoints": {"export/contract"},
@@ -136,7 +136,7 @@ def part_of(path: Path) -> str:
 
 
 def ours(path: Path) -> Iterator[tuple[str, Path]]:
-    """Yield (dotted name, file) of what a file imports from us; a folder's own `__init__` only where it is meant."""
+    """Yield (dotted name, file) of what a file imports from us; a folder's own `__init__` only if it is meant."""
     names = imports_of(path)
     for name in sorted(names):
         file = file_of(name)
@@ -178,7 +178,7 @@ def test_every_arrow_of_the_table_is_needed() -> None:
 
 
 def test_modules_do_not_import_each_other_in_a_circle() -> None:
-    """At import time; what a function imports later, or a type checker alone, makes no circle."""
+    """At import time; an import in a function, or for a type checker alone, makes no circle."""
     arrows: dict[Path, set[Path]] = {}
     for path in modules():
         names: set[str] = set()

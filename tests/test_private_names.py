@@ -108,7 +108,7 @@ def test_the_check_finds(source: str) -> None:
 
 
 def test_our_servers_classes_have_no_private_name_in_common_with_their_bases() -> None:
-    """What we define under a name that the base uses for itself would replace it without a word."""
+    """A definition of ours under a name that the base uses itself would silently replace it."""
     for file in SERVERS:
         module = importlib.import_module("rlservo." + file.removesuffix(".py").replace("/", "."))
         for node in ast.walk(ast.parse((ROOT / file).read_text())):

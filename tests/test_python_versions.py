@@ -65,7 +65,7 @@ def requirements(*extras: str) -> list[str]:
 
 
 def environment_of(minor: str, *options: str | Path) -> Path:
-    """Return the Python of an environment of Python 3.`minor`, or skip where there is none or pip cannot install."""
+    """Return the Python of an environment of Python 3.`minor`, or skip if there is none or pip cannot install."""
     try:
         return virtual_environment(*options, python=interpreter(minor), name=f"python3.{minor}")
     except RuntimeError as error:

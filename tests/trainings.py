@@ -30,7 +30,7 @@ ON_ONE_CORE = tuple(word for name in HALVES for word in ("--set", f"{name}=0.5")
 
 @dataclass(frozen=True)
 class Ended:
-    """How a script ended."""
+    """Outcome of a script."""
 
     code: int
     out: str
@@ -101,12 +101,12 @@ TRAINED_WITH = [
     versions("ray", "torch", "gymnasium", "numpy", "mujoco", "onnx", "onnxruntime"),
     str(EXAMPLES), str(OFFSCREEN),
 ]  # fmt: skip
-"""What those scripts run, and where: their output and what they leave names files."""
+"""Commands and folder of those scripts; their output and files name files."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """How a script ended, in which folder, and what it left in the home folder."""
+    """Outcome of a script, its folder, and the files it left in the home folder."""
 
     ended: Ended
     folder: Path

@@ -58,7 +58,7 @@ class Drive:
     ) -> None:
         """Open the policy and make the environment, by default the one it was trained in.
 
-        Raises UsageError if the two do not fit, and what `PolicySource.open` raises.
+        Raises UsageError if the two do not fit, and the errors of `PolicySource.open`.
         """
         self._source = source
         self._choice, self._link = choice, Link()
@@ -101,7 +101,7 @@ class Drive:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread, then close policies and environments; the source is whose it was."""
+        """End the thread, then close policies and environments, but not the source."""
         if self._thread.is_alive():
             self._commands.put(None)
             self._thread.join()
@@ -120,7 +120,7 @@ class Drive:
         self._phase, self._due = "driving", time.perf_counter()
 
     def pause(self) -> None:
-        """Stop the time."""
+        """Pause."""
         self._phase = "paused"
 
     def step(self) -> None:
@@ -148,25 +148,25 @@ class Drive:
         env.take_over()
 
     def set_speed(self, speed: float) -> None:
-        """Let time pass `speed` times as fast as on the wall."""
+        """Run at `speed` times real time."""
         self._speed = speed
 
     def drag_target(self, position: Vector) -> None:
-        """Put the target somewhere else, from any thread and without `do`; of many positions the last one counts."""
+        """Move the target, from any thread and without `do`; the latest position counts."""
         self._drag(self._put_target, position)
 
     def drag_robot(self, position: Vector) -> None:
-        """Begin an episode with the robot somewhere else; like `drag_target`."""
+        """Begin an episode with the robot at another place; like `drag_target`."""
         self._drag(self._put_robot, position)
 
     def move_obstacle(self, index: int, position: Vector) -> None:
-        """Put an obstacle somewhere else."""
+        """Move an obstacle."""
         for stage in self._stages():
             stage.env.move_obstacle(index, position)
         self._show_moved()
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Change the disturbances; an episode begins where the robot is."""
+        """Change the disturbances; an episode begins at the robot's pose."""
         for stage in self._stages():
             stage.disturb(disturbance)
         self._disturbance = disturbance
@@ -198,7 +198,7 @@ class Drive:
         self.play()
 
     def choose_ghost(self, choice: Choice | None) -> None:
-        """Let another version drive a ghost to the same target; None takes it away."""
+        """Let another version drive a ghost to the same target; None removes it."""
         self._drop_ghost()
         if choice is None:
             return
@@ -230,7 +230,7 @@ class Drive:
             self.view = self._view()
 
     def _guarded(self, command: Callable[[], None]) -> str:
-        """Run something; return what it raises in words: the thread continues."""
+        """Run a function; return its exception as text: the thread continues."""
         try:
             command()
         except (RlservoError, ValueError) as error:
@@ -304,7 +304,7 @@ class Drive:
             self._begin("here", keep_target=True)
 
     def _renew(self) -> None:
-        """Follow an alias that leads to another version by now."""
+        """Follow an alias that has been moved."""
         if not self._source.is_remote:
             return
         try:
@@ -335,7 +335,7 @@ class Drive:
         return None if value is None else float(value[0])
 
     def _step_ghost(self, action: Any) -> NDArray[Any] | None:
-        """Let the ghost take its step; return how its action differs for what the robot sees."""
+        """Let the ghost take its step; return how its action differs for the robot's observation."""
         try:
             return None if self._ghost is None else self._ghost.step(self._obs, action)
         except RlservoError as error:
@@ -399,7 +399,7 @@ class Drive:
         self._show_moved()
 
     def _show_moved(self) -> None:
-        """Show what was put elsewhere at once, also while time stands still."""
+        """Show moved objects at once, even while paused."""
         moved = self._stage.scene()
         self._before = replace(self._before, target=moved.target, obstacles=moved.obstacles)
         self._after = moved

@@ -16,7 +16,7 @@ class Ghost(Closeable):
     """A policy and a stage of its own; `close` closes both."""
 
     def __init__(self, policy: ActingPolicy, like: Stage) -> None:
-        """Build the same robot again. Raises UsageError if the policy does not fit it; then it is the caller's."""
+        """Build the same robot again. Raises UsageError if the policy does not fit it; then the caller keeps it."""
         self.stage = Stage(like.env_id, like.arguments, policy.contract)
         self._policy = policy
         self._obs: Any = None
@@ -31,16 +31,16 @@ class Ghost(Closeable):
         return self._policy.contract
 
     def begin(self, like: Stage) -> None:
-        """Begin an episode where the robot stands, with the same target."""
+        """Begin an episode at the robot's pose, with the same target."""
         self._obs, self._is_over = self.stage.begin_like(like), False
         self._policy.reset()
         scene = self.stage.scene()
         self.scenes = scene, scene
 
     def step(self, obs: Any, action: Any) -> NDArray[Any]:
-        """Let a control cycle pass; return how the policy's action differs from `action` for what the robot saw.
+        """Let a control cycle pass; return how the policy's action differs from `action` for the robot's observation.
 
-        Raises what `act` raises.
+        Raises the errors of `act`.
         """
         # Two rows, two episodes side by side: one follows the robot's observations, one the ghost's own.
         follows, own = self._policy.act(np.stack([obs, self._obs]))

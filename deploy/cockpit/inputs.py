@@ -1,4 +1,4 @@
-"""Checks of what a page sends: a client may send any value, and viser passes on most of them."""
+"""Checks of a page's messages: a client may send any value, and viser passes most of them on."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def point_of(position: Any) -> Vector | None:
 
 @contextlib.contextmanager
 def checked_messages() -> Iterator[None]:
-    """Refuse messages of another shape than viser's, and let what it cannot use be a line in the log, no traceback."""
+    """Refuse messages of another shape than viser's; log unusable ones in one line, without a traceback."""
     loggers = [logging.getLogger(name) for name in LOGGERS]
     for logger in loggers:
         logger.addFilter(_shorten)

@@ -61,7 +61,7 @@ class _Server(viser.ViserServer):
     """viser's server without its tunnel to the internet."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
-        """Refuse: a page can ask for it, with or without the button."""
+        """Refuse: a page can request it, with or without the button."""
         return None
 
 
@@ -103,7 +103,7 @@ def show(shown: Shown, stop: threading.Event) -> None:
 
 
 def set_value(handle: Any, value: Any) -> None:
-    """Let a choice or a slider have a value. (mypy does not see viser's setter.)"""
+    """Set the value of a choice or a slider. (mypy does not see viser's setter.)"""
     if handle.value != value:
         handle.value = value
 
@@ -161,7 +161,7 @@ def _silence() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _guarded_requests() -> Iterator[None]:
-    """Let only the cockpit's own page, and programs, talk to it, and no other page embed it: viser has no option.
+    """Let only the cockpit's own page, and programs, talk to it, and no other page embed it: viser has no such option.
 
     Any other web page in the same browser could drive the robot.
     """
@@ -186,7 +186,7 @@ def _guarded_requests() -> Iterator[None]:
 
 
 def _refusal(headers: Any) -> str:
-    """Return why a request is refused, or nothing. Programs send no Origin."""
+    """Return the reason to refuse a request, or an empty text. Programs send no Origin."""
     host = "".join(headers.get_all("Host")).lower()
     if not HOSTS.fullmatch(host):
         return f"the host {host[:100]!r} is not this machine: the cockpit is at {HOST}"

@@ -1,4 +1,4 @@
-"""The panel of a drive: buttons, choices and sliders, and what the policy sees and does."""
+"""The panel of a drive: buttons, choices, sliders, observations and actions."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class DrivePanel:
             self._looks.start()
 
     def close(self) -> None:
-        """End what runs besides the page."""
+        """End the panel's own threads."""
         self._is_closed.set()
         if self._looks.is_alive():
             self._looks.join()
@@ -163,7 +163,7 @@ class DrivePanel:
     # -- choices
 
     def _connect(self) -> None:
-        """Let every choice that a person makes reach the drive; those that we set ourselves do not."""
+        """Pass every choice of a person to the drive, but not those set by the code."""
 
         def on_change(handle: Any, action: Callable[[], None]) -> None:
             handle.on_update(lambda event: action() if event.client is not None else None)
@@ -228,7 +228,7 @@ class DrivePanel:
                 dropdown.options = options
 
     def _look_again(self) -> None:
-        """Offer what the server has by now, again and again; while it does not answer, what it had."""
+        """Update the choices from the server repeatedly; while it does not answer, keep the last ones."""
         while not self._is_closed.wait(LOOK_S):
             with contextlib.suppress(RlservoError):
                 self._versions = self._source.versions() or self._versions

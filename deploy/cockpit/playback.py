@@ -32,13 +32,13 @@ WAYS = {"Pause": 0, "Back": -1, "Step": 1}
 
 
 class Tape:
-    """Recorded episodes of one policy, and with a bundle what that would have done."""
+    """Recorded episodes of one policy, and with a bundle its actions for them."""
 
     def __init__(self, path: Path, *, bundle: Path | None = None, policy: str | None = None) -> None:
         """Raise UsageError if there is nothing to show, RecordingError if there is no recording."""
         recording = Recording(path)
         self.differences: list[NDArray[Any]] = []
-        """Of the bundle's actions from the recorded ones, by episode; NaN if they are not known."""
+        """Differences of the bundle's actions from the recorded ones, by episode; NaN if unknown."""
         self.moments: list[Moment] = []
         """The moments at which they differ most."""
         self.episodes: list[Episode] = []
@@ -99,7 +99,7 @@ class PlaybackPanel:
     """The page's content for a recording."""
 
     def __init__(self, server: viser.ViserServer, tape: Tape, *, env_id: str | None) -> None:
-        """Raise UsageError if the recorded policy's environment is none that can be drawn."""
+        """Raise UsageError if the recorded policy's environment cannot be drawn."""
         self._tape = tape
         contract = tape.contract
         home = env_id or home_of(contract)

@@ -1,4 +1,4 @@
-"""Policies to choose from: those of a server, or those of bundles on this machine."""
+"""Policies to choose from, on a server or in bundles on this machine."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PolicySource(Closeable, Protocol):
     is_remote: bool
 
     def versions(self) -> dict[str, list[str]]:
-        """Return what there is by policy: aliases, then versions from the newest on. May raise UnavailableError."""
+        """Return each policy's aliases, then its versions from the newest on. May raise UnavailableError."""
         ...
 
     def open(self, choice: Choice, link: Link) -> ActingPolicy:
@@ -118,4 +118,4 @@ class BundledPolicies(PolicySource):
         return open_policy(self._folders[choice])
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Nothing to close."""

@@ -1,4 +1,4 @@
-"""Readings of a policy: a table and words for its observation, moving plots for what it does."""
+"""Readings of a policy: a table and remarks on its observation, moving plots of its actions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Vector = NDArray[np.float64]
 
 
 class Elements:
-    """A space's elements: names, units, bounds, and where known what they were in training."""
+    """A space's elements: names, units, bounds and, if known, their values in training."""
 
     def __init__(self, space: LeafSpec, moments: tuple[Vector, Vector] | None = None) -> None:
         named = dict(enumerate(space.elements))
@@ -39,27 +39,27 @@ class Elements:
 
     @classmethod
     def observed(cls, contract: Contract) -> Elements:
-        """Return what a policy observes."""
+        """Return a policy's observation elements."""
         space = contract.observation_space
         assert isinstance(space, BoxSpec)  # of our simulators
         return cls(space, training_moments(contract))
 
     @classmethod
     def acted(cls, contract: Contract) -> Elements:
-        """Return what a policy commands."""
+        """Return a policy's action elements."""
         space = contract.action_space
         assert isinstance(space, BoxSpec)
         return cls(space)
 
     def deviations(self, values: Vector) -> Vector:
-        """Return how many standard deviations of the training values are from its mean; 0 if that is not known."""
+        """Return the distance from training's mean in standard deviations; 0 if unknown."""
         if self.moments is None:
             return np.zeros(len(values))
         mean, std = self.moments
         return (values - mean) / np.maximum(std, SMALLEST_STD)
 
     def words(self, values: Vector) -> list[str]:
-        """Return sentences on what is out of bounds or out of distribution, the worst first."""
+        """Return sentences on elements that are out of bounds or out of distribution, the worst first."""
         sentences = [
             f"{self.names[index]} is {values[index]:.4g}, outside {self.low[index]:g} to {self.high[index]:g}"
             for index in np.flatnonzero((values < self.low) | (values > self.high))
@@ -143,7 +143,7 @@ class Plot:
 
 
 class Readings:
-    """Plots of what one policy did, and a table of what it sees, in a panel next to the scene."""
+    """Plots of one policy's actions, and a table of its observation, in a panel next to the scene."""
 
     def __init__(
         self, gui: viser.GuiApi, contract: Contract, difference: str = "Ghost's action minus the action"
@@ -190,7 +190,7 @@ def _number(value: float | None) -> float:
 
 
 def _without_common_end(names: Sequence[str]) -> list[str]:
-    """Return names without the words at their end that all of them have: a legend is narrow."""
+    """Return names without their common last words: a legend is narrow."""
     words = [name.split("_") for name in names]
     while len(words) > 1 and len({each[-1] for each in words}) == 1 and min(map(len, words)) > 1:
         words = [each[:-1] for each in words]
@@ -204,5 +204,5 @@ def _bounds(low: float, high: float) -> str:
 
 
 def escape(text: str) -> str:
-    """Return text that markdown leaves as it is."""
+    """Return text escaped for markdown."""
     return "".join(f"\\{character}" if character in r"\`*_{}[]<>#|" else character for character in text)

@@ -1,4 +1,4 @@
-"""Runs the cockpit: opens what is to be seen, serves the page, draws until Ctrl-C."""
+"""Run of the cockpit: open the sources, serve the page, draw until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def run_watch(
     port: int,
     on_ready: OnReady,
 ) -> None:
-    """Show what a robot server's simulation does until Ctrl-C."""
+    """Show a robot server's simulation until Ctrl-C."""
     with ExitStack() as cleanup:
         server = cleanup.enter_context(served_page(port, f"rlservo cockpit: {address}"))
         panel = WatchPanel(server, address, env_arguments)
@@ -88,7 +88,7 @@ def _serve(server: viser.ViserServer, panel: Shown, on_ready: OnReady) -> None:
 
 
 def _first_choice(source: PolicySource, policy: str | None, version: str | None) -> Choice:
-    """Return what drives at first: of the policy, or the first one, the version that clients get who ask for none."""
+    """Return the initial choice: the default version of the policy, or of the first one."""
     versions = source.versions()
     if not versions:
         raise UnknownPolicyError("the server has no policy loaded")

@@ -31,7 +31,7 @@ MoveOne = Callable[[int, Vector], None]
 
 
 class Scenery:
-    """Everything of one robot that is drawn; `remove` takes it away."""
+    """All drawn objects of one robot; `remove` removes them."""
 
     def __init__(
         self,
@@ -104,7 +104,7 @@ class Scenery:
             self._draw_path(robot)
 
     def remove(self) -> None:
-        """Take everything away again."""
+        """Remove everything."""
         parts = (self._robot, self._ghost, self._target, self._start, *self._obstacles)
         for part in (*parts, self._beams, self._path, self._floor):
             if part is not None:
@@ -181,7 +181,7 @@ class _Bodies:
 
 
 class _Handle:
-    """Something to drag with the mouse or a finger; it stays under the finger that holds it."""
+    """A handle to drag with the mouse or a finger; it stays under that finger."""
 
     def __init__(self, server: viser.ViserServer, name: str, lift: float, is_planar: bool, on_move: Move) -> None:
         self._control = server.scene.add_transform_controls(

@@ -1,4 +1,4 @@
-"""A simulated robot on show: its environment, the disturbances round it, and where everything is drawn."""
+"""A simulated robot on show: its environment, disturbances, and the drawn positions."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ class Stage:
             self.cycle_s = 1.0 / (control_rate_of(self._made, self.arguments, contract) or 10.0)
 
     def check(self, contract: Contract) -> None:
-        """Raise UsageError if a policy's observations or actions are others than the environment's."""
+        """Raise UsageError if a policy's observations or actions differ from the environment's."""
         check_fit(contract, self._made, self.arguments)
 
     def disturb(self, disturbance: Disturbance) -> None:
-        """Change the disturbances, from the next episode on. Raises ValueError for what the robot cannot have."""
+        """Change the disturbances, from the next episode on. Raises ValueError for an unsupported one."""
         self._disturbed = DomainRandomization(
             self._made,
             action_latency=(disturbance.action_latency, disturbance.action_latency),
@@ -97,7 +97,7 @@ class Stage:
         return self._disturbed.reset(options=own)[0]
 
     def begin_like(self, other: Stage) -> Any:
-        """Begin an episode where another robot of the same kind stands, with the same target."""
+        """Begin an episode at the pose of another robot of the same kind, with the same target."""
         options = other.env.reset_options(start="here", keep_target=True)
         return self._disturbed.reset(options=options)[0]
 
@@ -107,7 +107,7 @@ class Stage:
         return obs, float(reward), terminated, truncated, info
 
     def scene(self) -> Scene:
-        """Return where everything is."""
+        """Return all positions."""
         env = self.env
         return Scene(
             poses=body_poses(env.data, self._bodies),
@@ -122,7 +122,7 @@ class Stage:
 
 
 def home_of(contract: Contract) -> str:
-    """Return the environment that a policy was trained in, undisturbed. Raises UsageError if it is none of ours."""
+    """Return the environment that a policy was trained in, undisturbed. Raises UsageError if it is not one of ours."""
     trained = contract.provenance
     env_id = trained.env_id and wrapped_env(trained.env_id, trained.env_config)[0]
     if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
@@ -134,5 +134,5 @@ def home_of(contract: Contract) -> str:
 
 
 def home_arguments(contract: Contract) -> dict[str, Any]:
-    """Return what of that environment's arguments decides how the robot looks."""
+    """Return those of the environment's arguments that decide the robot's appearance."""
     return {name: value for name, value in contract.provenance.env_config.items() if name == "ur_model"}

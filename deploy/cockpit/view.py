@@ -1,4 +1,4 @@
-"""The view of a drive: everything of one moment, and the control cycles that led there."""
+"""The view of a drive: one moment, and the control cycles before it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Cycle:
 
 @dataclass(frozen=True)
 class View:
-    """Everything that is drawn of one moment."""
+    """The drawn state of one moment."""
 
     stage: Stage
     contract: Contract

@@ -27,7 +27,7 @@ class WatchPanel:
     """The page's content for a robot server."""
 
     def __init__(self, server: viser.ViserServer, address: str, arguments: Mapping[str, Any]) -> None:
-        """Look once. Raises UnavailableError if no robot server answers; later it may go away and come back."""
+        """Read once. Raises UnavailableError if no robot server answers; later one may stop and start again."""
         self._server, self._arguments = server, dict(arguments)
         self._reader = StateReader(address)
         try:
@@ -51,7 +51,7 @@ class WatchPanel:
 
     @property
     def scene(self) -> Scene:
-        """Positions at the last look."""
+        """Positions at the last reading."""
         return self._scenes[1]
 
     def draw(self) -> None:
@@ -79,7 +79,7 @@ class WatchPanel:
         )
 
     def close(self) -> None:
-        """End the looks and the connection."""
+        """End reading and the connection."""
         self._is_closed.set()
         self._looks.join()
         self._reader.close()

@@ -47,7 +47,7 @@ def cockpit(
 ) -> None:
     """Show in the browser how a policy drives a robot.
 
-    Drag its target, and read what the policy sees. Ctrl-C ends it.
+    Drag its target, read its observations. Ctrl-C ends it.
 
     Example: `rlservo cockpit --url http://127.0.0.1:8000 --policy ur5`
     """
@@ -81,7 +81,7 @@ def cockpit(
 
 
 def drive_on_page(url: str, port: int) -> None:
-    """Show what a server's policies drive, on a page, until an interrupt."""
+    """Show on a page robots driven by a server's policies, until an interrupt."""
     with needs_extra("cockpit"):
         from rlservo.deploy.cockpit.run import run_drive
 

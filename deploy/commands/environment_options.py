@@ -1,4 +1,4 @@
-"""Options of an environment that commands make: its constructor's arguments, and how it draws without a display."""
+"""Options of a command's environment: constructor arguments, and drawing without a display."""
 
 from __future__ import annotations
 

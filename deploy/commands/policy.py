@@ -45,7 +45,7 @@ LOCAL = "http://127.0.0.1:8000"
 def list_policies(
     url: Url = LOCAL, key_file: KeyFile = None, repository: Repository = None, as_json: Json = False
 ) -> None:
-    """Show what is served, and since when. With --repository also the versions that are not loaded.
+    """Show the served versions, and since when. With --repository also the versions that are not loaded.
 
     Behind a proxy or on Ray Serve the table is the answering replica's alone: ask again for others, or read
     `rlservo_plan_generation` in each one's metrics.

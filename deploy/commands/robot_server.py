@@ -54,7 +54,7 @@ def robot_server_ur(
         str, typer.Option(help="Content of a state: only_robot, 1object, 1moving2points or 2objects2points.")
     ] = "only_robot",
     action_mode: Annotated[
-        str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from where the arm is.")
+        str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from the present ones.")
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 25.0,
     max_velocity_scale_factor: Annotated[
@@ -226,7 +226,7 @@ def ur_controller(
     jitter_ms: Annotated[float, typer.Option(min=0.0, help="Largest additional delay (jitter).")] = 0.0,
     drop: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of RTDE data packages that are lost.")] = 0.0,
 ) -> None:
-    """Be the controller of a simulated UR arm until Ctrl-C. Lines on standard input stop the arm or cut the link.
+    """Run the controller of a simulated UR arm until Ctrl-C. Lines on standard input stop the arm or cut the link.
 
     Example: `rlservo ur-controller --model ur5e`, then `rtde_control.RTDEControlInterface("127.0.0.1")` in Python;
     `help` and Enter lists the lines
@@ -259,7 +259,7 @@ def _serve(settings: Settings, title: str) -> None:
 
 @contextmanager
 def _one_sentence_errors() -> Iterator[None]:
-    """Turn the simulators' refusals into errors of the command line, and name a missing extra."""
+    """Turn the simulators' errors into those of the command line, and name a missing extra."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     try:
         with needs_extra("sim", "mujoco", "grpc"):

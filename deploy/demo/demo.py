@@ -1,4 +1,4 @@
-"""`rlservo demo`: export two checkpoints, serve them on both engines, drive two robots, show what happened.
+"""`rlservo demo`: export two checkpoints, serve them on both engines, drive two robots, show the results.
 
 Exporting and serving run as the very commands a user would type, in other processes; the loop runs here.
 """

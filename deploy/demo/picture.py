@@ -43,7 +43,7 @@ class RobotRun:
 
 
 def film(policy: ActingPolicy, env_id: str, *, seed: int, steps: int, note: Callable[[str], object]) -> list[Frame]:
-    """Return the first, middle and last picture of an episode that had so many steps with this seed.
+    """Return the first, middle and last picture of an episode with this seed and number of steps.
 
     None, with a note, if the machine cannot draw. Only these are drawn: a picture costs more than a step and its
     action together.

@@ -3,7 +3,7 @@
 #
 # Every argument goes to examples/simple_trainer.py; --num-cpus is one less than the node's cores, for the driver.
 # Two minutes before the time is up Slurm sends SIGTERM, which the trainer takes as Ctrl-C; submit again with
-# --resume runs/... (or with RLSERVO_RESUME=last) and it goes on.
+# --resume runs/... (or with RLSERVO_RESUME=last) to continue.
 #SBATCH --job-name=rlservo-train
 #SBATCH --nodes=1
 #SBATCH --ntasks=1
@@ -19,7 +19,7 @@ python="${RLSERVO_PYTHON:-.venv/bin/python}"
 cores="${SLURM_CPUS_PER_TASK:?ask for the cores of the node with --cpus-per-task}"
 
 if [ "${RLSERVO_RESUME:-}" = last ]; then
-  # run.json is in every run's folder; the newest run is the one to go on with.
+  # run.json is in every run's folder; the newest run is resumed.
   newest="$(find "${RLSERVO_STORAGE:-runs}" -mindepth 2 -maxdepth 2 -name run.json -printf '%T@ %h\n' | sort -n | tail -n 1)"
   set -- --resume "${newest#* }"
 else

@@ -1,9 +1,9 @@
 #!/usr/bin/env bash
 # Train on several nodes: sbatch --nodes=3 deploy/slurm/several_nodes.sh --run PPO --name-env CartPole-v1
 #
-# Ray's head runs on the first node, a worker on each of the others, examples/simple_trainer.py beside the head. Every
+# Ray's head runs on the first node, a worker on each of the others, examples/simple_trainer.py next to the head. Every
 # argument goes to the trainer; --num-cpus is all nodes' cores but one, for the driver. The folder for results must be
-# one that all nodes see. RLSERVO_RESUME=last goes on with the newest run. The cluster has a token of its own, and ends with the job.
+# one that all nodes see. RLSERVO_RESUME=last resumes the newest run. The cluster has a token of its own, and ends with the job.
 #SBATCH --job-name=rlservo-train
 #SBATCH --nodes=2
 #SBATCH --ntasks-per-node=1
@@ -49,7 +49,7 @@ trap finish EXIT
 
 address="$(srun --nodes=1 --ntasks=1 --overlap --nodelist="$head" hostname -I | awk '{print $1}')"
 [ -n "$address" ] || { echo "several_nodes.sh: node $head has no address" >&2; exit 1; }
-wait_for_nodes() { # wait_for_nodes COUNT: a trial that does not fit yet would wait without saying so
+wait_for_nodes() { # wait_for_nodes COUNT: a trial that does not fit yet would wait silently
   "$python" - "$address:$port" "$1" <<'PYTHON'
 import subprocess
 import sys
@@ -75,7 +75,7 @@ sys.exit(f"several_nodes.sh: of {wanted} Ray nodes at {address}, {there} answere
 PYTHON
 }
 
-# The dashboard is off, but Ray still looks whether its port is free. Off, too: the autoscaler.
+# The dashboard is off, but Ray still checks whether its port is free. The autoscaler is off as well.
 on_node "$head" "${ray[@]}" start --head --block --node-ip-address="$address" --port="$port" --temp-dir="$folder" \
   --num-cpus="$cores" --num-gpus="$gpus" --include-dashboard=false --dashboard-port="$((port + 1))" --no-monitor
 wait_for_nodes 1
@@ -85,7 +85,7 @@ done
 wait_for_nodes "${#nodes[@]}"
 
 if [ "${RLSERVO_RESUME:-}" = last ]; then
-  # run.json is in every run's folder; the newest run is the one to go on with.
+  # run.json is in every run's folder; the newest run is resumed.
   newest="$(find "${RLSERVO_STORAGE:-runs}" -mindepth 2 -maxdepth 2 -name run.json -printf '%T@ %h\n' | sort -n | tail -n 1)"
   set -- --resume "${newest#* }"
 else

@@ -1,6 +1,7 @@
 """The two laser scanners, by casting rays at the walls and cubes of the model.
 
-A reading is what robo-gym's robot server gives on: Gaussian noise added by the sensor, clipped to the scanner's range.
+A reading is as robo-gym's robot server passes it on: Gaussian noise added by the sensor, clipped to the scanner's
+range.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class LaserScanners:
         np.clip(readings, LASER_MIN, LASER_MAX, out=readings)
 
     def ends(self, readings: Vector) -> Vector:
-        """Return where beams begin and end in the map frame [m] (n, 2, 3): all, or as many picked evenly from all."""
+        """Return both ends of the beams in the map frame [m] (n, 2, 3): of all, or of as many picked evenly."""
         picked = pick_beams(len(readings))
         x, y, yaw = self._data.qpos.tolist()
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -90,7 +91,7 @@ def pick_beams(count: int) -> NDArray[np.intp]:
 
 
 class _Beams:
-    """One scanner's share of the arrays, in the form MuJoCo wants them."""
+    """One scanner's share of the arrays, in MuJoCo's form."""
 
     def __init__(
         self, scanner: Scanner, share: slice, directions: Vector, distances: Vector, geoms: NDArray[np.int32]

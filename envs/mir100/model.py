@@ -134,7 +134,7 @@ def _target() -> str:
 
 
 def _housing() -> str:
-    """The white shell with the dark slit the scanners look out of, the light band, the dark top."""
+    """The white shell with the scanners' dark slit, the light band, the dark top."""
     centre_x = BODY_CENTRE[0]
 
     def slab(low: float, high: float, inset: float, material: str, corner: float = 0.06) -> str:

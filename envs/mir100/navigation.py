@@ -170,7 +170,7 @@ class Mir100Navigation(RenderedEnv):
         self._base_offset = offset
 
     def sensor_errors(self) -> dict[str, SensorError]:
-        """Return what the real robot's localisation, odometry and scanners add."""
+        """Return the errors of the real robot's localisation, odometry and scanners."""
         return sensor_errors(self.LASER_COUNT, LINEAR_SCALE, ANGULAR_SCALE)
 
     @property
@@ -192,7 +192,7 @@ class Mir100Navigation(RenderedEnv):
         return np.array([x, y, 0.0])
 
     def move_target(self, position: ArrayLike) -> None:
-        """Put the target somewhere else on the map [m] (3,) within the episode; the next step scores no progress."""
+        """Move the target on the map [m] (3,) within the episode; the next step scores no progress."""
         x, y, _ = as_vector("position", position, 3).tolist()
         self.simulation.move_target((x, y, self.simulation.target[2]))
         self._previous_distance = None
@@ -202,7 +202,7 @@ class Mir100Navigation(RenderedEnv):
         return np.array([(x, y, 0.0) for x, y, _ in self.simulation.cubes]).reshape(-1, 3)
 
     def move_obstacle(self, index: int, position: ArrayLike) -> None:
-        """Put a cube somewhere else on the map [m] (3,) within the episode, turned as it is."""
+        """Move a cube on the map [m] (3,) within the episode, without turning it."""
         x, y, _ = as_vector("position", position, 3).tolist()
         yaws = {number: yaw for number, (_, _, yaw) in enumerate(self.simulation.cubes)}
         self.simulation.move_cube(index, (x, y, yaws.get(index, 0.0)))
@@ -217,7 +217,7 @@ class Mir100Navigation(RenderedEnv):
         return {**options, "start_pose": self.simulation.pose} if start == "here" else options
 
     def start_at(self, position: ArrayLike) -> dict[str, Any]:
-        """Return the options of an episode that starts there on the map [m] (3,), turned as the robot is."""
+        """Return the options of an episode that starts there on the map [m] (3,), with the robot's heading."""
         x, y, _ = as_vector("position", position, 3).tolist()
         return {"start_pose": (x, y, self.simulation.pose[2])}
 
@@ -247,11 +247,11 @@ class Mir100Navigation(RenderedEnv):
 
     @abstractmethod
     def _place(self, start: Sequence[float], target: Sequence[float], options: Mapping[str, Any]) -> None:
-        """Put everything in its place; `options` has what only this task knows. Raises InvalidResetError."""
+        """Place everything; `options` has the task's own options. Raises InvalidResetError."""
 
     @abstractmethod
     def _failure(self) -> str | None:
-        """Return the final status if the robot has failed, None if it has not."""
+        """Return the final status if the robot has failed, else None."""
 
     # -- parts
 

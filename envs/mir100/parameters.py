@@ -1,4 +1,4 @@
-"""The MiR100's figures. Everything else about the robot is computed from them.
+"""Parameters of the MiR100. Everything else about the robot is computed from them.
 
 Sources: body, wheels, scanner poses, scanner range and noise from the robot description of DFKI-NI/mir_robot
 (mir_100_v1.urdf.xacro, sick_s300.urdf.xacro), speed limits and the time-out from its diff_drive_controller settings
@@ -51,7 +51,7 @@ class Scanner:
 
     @property
     def count(self) -> int:
-        """Number of beams are left."""
+        """Number of beams that are left."""
         return self.BEAMS - self.dropped_first - self.dropped_last
 
     @property

@@ -1,4 +1,4 @@
-"""The simulated robot: put it somewhere, command velocities, let a control cycle pass, read pose, lasers and contacts.
+"""The simulated robot: place it, command velocities, let a control cycle pass, read pose, lasers and contacts.
 
 It follows robo-gym's robot server and the diff_drive_controller below it. Poses are x, y [m] and yaw [rad] of base_link
 in the map frame.
@@ -236,7 +236,7 @@ class Mir100Simulation:
     def scan(self) -> Vector:
         """All readings [m], (1012,): the front scanner's 501, then the back scanner's 511, each counter-clockwise.
 
-        0.05 .. 29.0; 29.0 is also what a beam that meets nothing reads. The array is reused for the next cycle.
+        0.05 .. 29.0; a beam that meets nothing also reads 29.0. The array is reused for the next cycle.
         """
         self._bring_scan_up_to_date()
         return self._lasers.readings

@@ -1,4 +1,4 @@
-"""The two places the robot drives in, as robo-gym's Gazebo worlds have them.
+"""The robot's two worlds, as in robo-gym's Gazebo.
 
 Source: jr-robotics/robo-gym-robot-servers, mir100_robot_server/worlds. Poses are x, y [m] and yaw [rad] in the map
 frame.
@@ -57,7 +57,7 @@ WORLDS = {world.name: world for world in (EMPTY, LAB_6X8)}
 
 
 def find_world(name: str) -> World:
-    """Return the world of that name, or raise ValueError naming those there are."""
+    """Return the world of that name, or raise ValueError naming the worlds."""
     if name not in WORLDS:
         raise ValueError(f"world {name!r} does not exist: expected one of {', '.join(WORLDS)}")
     return WORLDS[name]

@@ -1,4 +1,4 @@
-"""Clock of a robot server: a cycle ends at once (`fast`), or when its time on the wall is over (`real`).
+"""Clock of a robot server: a cycle ends at once (`fast`), or when its real time is over (`real`).
 
 Either way the same calls give the same trajectory. In real time a client that does not keep pace is waited for, up to
 half a second; beyond that time continues without it, as it does on the robot.
@@ -21,7 +21,7 @@ class Clock:
         self._due: float | None = None  # when the last cycle ends
 
     def count_missed_cycles(self) -> int:
-        """Return how many cycles have passed without a command, and count them as passed."""
+        """Return the number of cycles that passed without a command, and count them as passed."""
         if not self._real or self._due is None:
             return 0
         delay_s = time.monotonic() - self._due
@@ -32,7 +32,7 @@ class Clock:
         return min(cycles, round(MAX_CATCH_UP_S / self._cycle_s))
 
     def count_cycles(self, cycles: int) -> float | None:
-        """Count cycles that were simulated just now. Return what to `wait` for before answering."""
+        """Count cycles that were simulated just now. Return the moment to `wait` for before answering."""
         if not self._real:
             return None
         now = time.monotonic()

@@ -1,4 +1,4 @@
-"""Count the clients connected to one of our ports, as the kernel sees them. gRPC does not report it."""
+"""Number of clients connected to one of our ports, from the kernel: gRPC does not report it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads the roslaunch lines that robo-gym's environments send to a server manager.
+"""Parser of the roslaunch lines that robo-gym's environments send to a server manager.
 
 Arguments and their defaults: jr-robotics/robo-gym-robot-servers, ur_robot_server/launch/ur_robot_server.launch and
 mir100_robot_server/launch/sim_robot_server.launch. Unknown arguments are refused by name; one that only concerns the
@@ -37,7 +37,7 @@ MAX_LINE, MAX_VALUE = 10_000, 1_000  # [characters]; robo-gym's own lines have a
 
 
 def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host: str = "127.0.0.1") -> Settings:
-    """Return the settings that a roslaunch line asks for.
+    """Return the settings of a roslaunch line.
 
     Raises ValueError naming the package, launch file, argument or value that is not known or not simulated.
     """

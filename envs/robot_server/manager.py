@@ -59,9 +59,9 @@ class RobotServers:
             return {port: server.pid for port, server in self._running.items()}
 
     def start(self, line: str, *, gui: bool = False) -> int:
-        """Start what a roslaunch line asks for and return its port, once it answers.
+        """Start the robot server of a roslaunch line and return its port, once it answers.
 
-        Raises ValueError for a line that cannot be honoured, for too many servers, and when it does not come up.
+        Raises ValueError for an impossible line, for too many servers, and when it does not come up.
         """
         settings = parse_launch_line(line, gui=gui, clock=self._clock, host=self._host)
         with self._lock:
@@ -87,7 +87,7 @@ class RobotServers:
         raise ValueError("this server manager is ending")
 
     def kill(self, port: int) -> None:
-        """End the robot server on `port`, or forgive that it has ended already. Raises ValueError for other ports."""
+        """End the robot server on `port`; one that has ended already is no error. Raises ValueError for other ports."""
         with self._lock:
             server = self._running.pop(port, None)
             has_ended = port in self._dead_ports
@@ -100,7 +100,7 @@ class RobotServers:
             raise ValueError(f"there is no robot server on port {port}; running: {ports}")
 
     def kill_all(self) -> None:
-        """End every robot server, side by side."""
+        """End all robot servers in parallel."""
         with self._lock:
             servers = list(self._running.values())
             self._dead_ports.update(self._running)
@@ -154,7 +154,7 @@ class ManagerService:
         self._servers = servers
 
     def handler(self) -> grpc.GenericRpcHandler:
-        """Return what a gRPC server is given."""
+        """Return the handler for a gRPC server."""
         calls: dict[str, Callable[[bytes], Any]] = {
             "StartNewServer": self._start,
             "KillServer": self._kill,

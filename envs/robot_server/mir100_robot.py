@@ -1,4 +1,4 @@
-"""The MiR100 with robo-gym's vocabulary, over its simulation.
+"""The MiR100 with robo-gym's interface, on its simulation.
 
 Source of the behaviour: jr-robotics/robo-gym-robot-servers, mir100_robot_server.
 """

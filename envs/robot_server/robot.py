@@ -1,4 +1,4 @@
-"""Robot behind a robot server: put it somewhere, command it for one cycle, look at it."""
+"""Robot of a robot server: place it, command it for one cycle, read its state."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class RobotState:
 
 
 class Robot(Protocol):
-    """A robot, simulated or real. Every method raises ValueError for what it cannot honour."""
+    """A robot, simulated or real. Every method raises ValueError for an impossible request."""
 
     @property
     def is_real(self) -> bool:
@@ -43,7 +43,7 @@ class Robot(Protocol):
         ...
 
     def set_state(self, target: RobotState) -> int:
-        """Put the robot and its scene as `target` has them; return how many cycles that counts as."""
+        """Place the robot and its scene as in `target`; return the number of cycles that this counts as."""
         ...
 
     def act(self, action: Sequence[float]) -> None:

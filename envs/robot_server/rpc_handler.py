@@ -1,6 +1,6 @@
 """gRPC handler of robo-gym's services: every failure is a reply and a line in the log.
 
-robo-gym asks ten times for what was refused: the same failure within a minute is not logged again. Requests are parsed
+robo-gym repeats a refused request ten times: the same failure within a minute is not logged again. Requests are parsed
 by the calls rather than by gRPC, so that garbage is answered like every other error.
 """
 
@@ -20,7 +20,7 @@ REPEATED_S = 60.0
 def rpc_handler(
     service: str, calls: Mapping[str, Callable[[bytes], Any]], fail: Callable[[str, str], Any], log: logging.Logger
 ) -> grpc.GenericRpcHandler:
-    """Return what a gRPC server is given; `fail` makes the reply from a failed call's name and the reason."""
+    """Return the handler for a gRPC server; `fail` makes the reply from a failed call's name and the reason."""
     last, last_at = "", 0.0
 
     def is_new(line: str) -> bool:

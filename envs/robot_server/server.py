@@ -1,4 +1,4 @@
-"""Runs one robot server: makes the robot, binds a port, serves until it is stopped.
+"""One robot server: the robot, a bound port, and service until it is stopped.
 
 `rlservo robot-server` runs it in the foreground. The server manager runs it as a process of its own
 (`python -m rlservo.envs.robot_server.server '<settings>'`), which prints its port on standard output, and ends
@@ -58,7 +58,7 @@ class RobotServer:
         self._server.start()
 
     def stop(self) -> None:
-        """Refuse new calls, abort what runs on for a tenth of a second, and free the port."""
+        """Refuse new calls, abort those that run longer than a tenth of a second, and free the port."""
         self._server.stop(grace=0.1).wait(timeout=1.0)
         self.robot.close()
 
@@ -110,7 +110,7 @@ def _probe(host: str, port: int, address: str) -> None:
 
 
 def stop_signals() -> queue.SimpleQueue[int]:
-    """Return where SIGTERM and SIGINT arrive from now on. Main thread only.
+    """Return an object that receives SIGTERM and SIGINT from now on. Main thread only.
 
     Not an Event: `set` in a handler waits indefinitely when the signal interrupts its own thread inside `wait`,
     which holds the lock. A SimpleQueue's `put` may interrupt its `get`.

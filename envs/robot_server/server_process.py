@@ -17,7 +17,7 @@ TERMINATE_TIMEOUT_S = 0.4
 
 
 class StartFailedError(ValueError):
-    """The robot server did not come up."""
+    """The robot server did not start."""
 
 
 class ServerProcess:
@@ -53,7 +53,7 @@ class ServerProcess:
         return self._process.poll()
 
     def end(self) -> None:
-        """Ask it to end, and kill it if it has not in 0.4 s."""
+        """Ask it to end, and kill it after 0.4 s."""
         self._process.terminate()
         try:
             self._process.wait(TERMINATE_TIMEOUT_S)
@@ -62,7 +62,7 @@ class ServerProcess:
         self.kill()
 
     def kill(self) -> None:
-        """Kill it, collect what is left of it, and close the pipes."""
+        """Kill it, reap the process, and close the pipes."""
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):

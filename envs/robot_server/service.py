@@ -1,4 +1,4 @@
-"""robo-gym's RobotServer service over a robot: the one file here that knows both.
+"""robo-gym's RobotServer service for a robot: the only file here that knows both.
 
 An error is answered with `success = false`: the message has no field for a reason, which is in the log.
 """
@@ -29,7 +29,7 @@ class RobotService:
         self._turn = threading.Lock()  # held by a command until its cycle is over
 
     def handler(self) -> grpc.GenericRpcHandler:
-        """Return what a gRPC server is given."""
+        """Return the handler for a gRPC server."""
         calls: dict[str, Callable[[bytes], Any]] = {
             "GetState": self.get_state,
             "SetState": self.set_state,

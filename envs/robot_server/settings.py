@@ -43,7 +43,7 @@ OBJECTS_BY_MODE = {
 
 @dataclass(frozen=True)
 class Common:
-    """Settings that every robot server has."""
+    """Settings of every robot server."""
 
     host: str = "127.0.0.1"
     port: int = 0  # 0: any free one

@@ -1,4 +1,4 @@
-"""Reads a robot server's state while a client drives it, and shows it on an environment's simulator."""
+"""Reader of a robot server's state while a client drives it, shown on an environment's simulator."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class RobotServerError(ConnectionError):
 
 
 class StateReader:
-    """A connection to a robot server that only looks: GetState changes nothing.
+    """A read-only connection to a robot server: GetState changes nothing.
 
     A robot server that waits for a client's end (`--orphan-timeout`) waits for this one's too.
     """
@@ -54,7 +54,7 @@ class StateReader:
 
 
 def env_of(state: RobotState) -> str:
-    """Return the environment that has the robot and the world of a state. Raises RobotServerError."""
+    """Return the environment with a state's robot and world. Raises RobotServerError."""
     if f"{JOINTS[0]}_joint_position" in state.names:
         has_object = OBJECT[0] in state.names
         return f"rlservo/{'EndEffectorPositioning' if has_object else 'EmptyEnvironment'}URSim-v0"
@@ -83,7 +83,7 @@ def show_state(env: RenderedEnv, state: RobotState) -> None:
 
 
 def quantities(state: RobotState) -> dict[str, tuple[float, str]]:
-    """Return what is worth a look of a state: value and unit by name."""
+    """Return a state's main values: value and unit by name."""
     if state.names:
         return {name: (value, _unit(name)) for name, value in sorted(state.names.items())}
     names = ("target_x", "target_y", "target_yaw", "x", "y", "yaw", "linear_velocity", "angular_velocity")

@@ -1,4 +1,4 @@
-"""A UR arm with robo-gym's vocabulary, over the arm's simulation.
+"""A UR arm with robo-gym's interface, on the arm's simulation.
 
 Source of the behaviour: jr-robotics/robo-gym-robot-servers, ur_robot_server. On the wire joints come in ROS order.
 """

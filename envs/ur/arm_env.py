@@ -175,13 +175,13 @@ class URArmEnv(RenderedEnv):
         super().close()
 
     def limited(self) -> dict[str, int] | None:
-        """Return in how many cycles of a real arm's command stream each limit was kept; None for a simulated arm."""
+        """Return the number of command cycles in which each limit of a real arm applied; None for a simulated arm."""
         return self.simulation.limited()
 
     # -- for disturbances
 
     def set_robot_model(self, name: str) -> None:
-        """Put another arm on the table; `reset` is next. Raises ValueError naming the seven, and for a real arm."""
+        """Put another arm on the table; call `reset` next. Raises ValueError naming the seven, and for a real arm."""
         if self.is_real:
             raise ValueError(f"a real arm cannot be exchanged for {name!r}")
         simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
@@ -231,11 +231,11 @@ class URArmEnv(RenderedEnv):
 
     @abstractmethod
     def _fixed_values(self) -> Vector:
-        """Return what the fixed joints' action elements are, (6,)."""
+        """Return the action elements of fixed joints, (6,)."""
 
     @abstractmethod
     def _to_joint_positions(self, command: Vector) -> Vector:
-        """Turn an action of all six joints into the joint positions [rad] it asks for."""
+        """Turn an action of all six joints into joint positions [rad]."""
 
     @abstractmethod
     def _observation(self) -> Observation:
@@ -245,11 +245,11 @@ class URArmEnv(RenderedEnv):
     def _judge(self, observation: Observation, command: Vector) -> tuple[float, str | None]:
         """Return the reward of the step that ended with `observation`, and the final status if it ends the episode.
 
-        The time limit is not its concern.
+        The time limit is checked elsewhere.
         """
 
     def _final_info(self, status: str) -> dict[str, Any]:  # noqa: ARG002
-        """Return what the last step's info holds besides the status."""
+        """Return the last step's info besides the status."""
         return {}
 
     # -- parts

@@ -119,7 +119,7 @@ class BasicAvoidanceURSim(URArmEnv):
     # -- for disturbances
 
     def sensor_errors(self) -> dict[str, SensorError]:
-        """Return what a real arm's sensors and a camera add."""
+        """Return the errors of a real arm's sensors and a camera."""
         joints = joint_errors("position_normalized") | joint_errors("offset_normalized")
         elbow = polar_errors("object_to_elbow") if self._include_polar_to_elbow else {}
         return polar_errors("object") | joints | elbow

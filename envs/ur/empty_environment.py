@@ -1,4 +1,4 @@
-"""robo-gym's empty environment: the arm alone, nothing to reach, to try a controller or a policy's plumbing on."""
+"""robo-gym's empty environment: only the arm, to try a controller or a policy's interfaces."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ class EndEffectorPositioningURSim(URArmEnv):
     # -- for disturbances
 
     def sensor_errors(self) -> dict[str, SensorError]:
-        """Return what a real arm's sensors add; the previous actions are known exactly."""
+        """Return the errors of a real arm's sensors; the previous actions are known exactly."""
         joints = joint_errors("position_normalized") | velocity_errors()
         return polar_errors("target") | joints | position_errors()
 
@@ -165,7 +165,7 @@ class EndEffectorPositioningURSim(URArmEnv):
         return self._target + BASE
 
     def move_target(self, position: ArrayLike) -> None:
-        """Put the target somewhere else in MuJoCo's world [m] (3,) within the episode."""
+        """Move the target in MuJoCo's world [m] (3,) within the episode."""
         self._target = as_vector("position", position, 3) - BASE
         self.simulation.place_object(0, self._target)
 

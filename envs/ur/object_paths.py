@@ -55,7 +55,7 @@ class Parameters:
         return int(value)
 
     def samples(self, name: str) -> int:
-        """Return how many positions a time [s] is, zero included."""
+        """Return the number of positions in a time [s], zero included."""
         seconds = self.number(name)
         if not 0.0 <= seconds * UPDATE_RATE_HZ <= MAX_POINTS:
             raise ValueError(

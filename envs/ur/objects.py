@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """A sphere or a cube that is moved about and pushes nothing, as in Gazebo (`collide_without_contact`)."""
+    """A sphere or a cube that moves and pushes nothing, as in Gazebo (`collide_without_contact`)."""
 
     shape: str  # MuJoCo's geom type
     half_size: float  # [m], a sphere's radius, half a cube's edge
@@ -30,7 +30,7 @@ OBJECT_MODELS: dict[str, ObjectModel] = {
 
 
 def object_model(name: str) -> ObjectModel:
-    """Return the object of that name, or raise ValueError naming those there are."""
+    """Return the object of that name, or raise ValueError naming the objects."""
     if name not in OBJECT_MODELS:
         raise ValueError(f"object model {name!r} does not exist: expected one of {', '.join(OBJECT_MODELS)}")
     return OBJECT_MODELS[name]

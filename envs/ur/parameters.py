@@ -1,4 +1,4 @@
-"""The figures of the seven arms, in one table; everything else about them is computed from it.
+"""Parameters of the seven arms, in one table; everything else about them is computed from it.
 
 Sources: kinematics, link frames, masses and limits from ros-industrial/universal_robot (ur_description); workspace
 radii, the start pose and its randomisation from jr-robotics/robo-gym 2.0. Joints are in standard order everywhere.
@@ -88,7 +88,7 @@ UR_PARAMETERS: dict[str, URParameters] = {
 
 
 def cycle_of(rate_hz: float) -> float:
-    """Return how long a control cycle lasts [s], or raise ValueError for a rate outside RATES_HZ."""
+    """Return the duration of a control cycle [s], or raise ValueError for a rate outside RATES_HZ."""
     low, high = RATES_HZ
     if not low <= rate_hz <= high:
         raise ValueError(f"action_cycle_rate is {rate_hz:g} Hz: expected {low:g} to {high:g} Hz")
@@ -96,7 +96,7 @@ def cycle_of(rate_hz: float) -> float:
 
 
 def ur_parameters(model: str) -> URParameters:
-    """Return the figures of one arm, or raise ValueError naming the seven."""
+    """Return the parameters of one arm, or raise ValueError naming the seven."""
     if model not in UR_PARAMETERS:
         raise ValueError(f"ur_model {model!r} does not exist: expected one of {', '.join(UR_PARAMETERS)}")
     return UR_PARAMETERS[model]

@@ -30,7 +30,7 @@ RS_MODES: dict[str, RsMode] = {
 
 
 def rs_mode_of(name: str) -> RsMode:
-    """Return the mode of that name, or raise ValueError naming those there are."""
+    """Return the mode of that name, or raise ValueError naming the modes."""
     if name not in RS_MODES:
         raise ValueError(f"rs_mode {name!r} does not exist: expected one of {', '.join(RS_MODES)}")
     return RS_MODES[name]

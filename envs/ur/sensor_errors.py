@@ -42,7 +42,7 @@ def velocity_errors() -> dict[str, SensorError]:
 
 
 def polar_errors(prefix: str) -> dict[str, SensorError]:
-    """Return the errors of what a camera sees, in polar coordinates."""
+    """Return the errors of a camera's positions, in polar coordinates."""
     angle = SensorError(CAMERA_NOISE / TARGET_DISTANCE, CAMERA_BIAS / TARGET_DISTANCE)
     return {
         f"{prefix}_r": SensorError(CAMERA_NOISE, CAMERA_BIAS),

@@ -1,4 +1,4 @@
-"""The simulated arm: put it somewhere, command joint positions, let a control cycle pass, read where everything is.
+"""The simulated arm: place it, command joint positions, let a control cycle pass, read positions.
 
 It follows robo-gym's robot server: a command becomes a one-point joint trajectory, and the next command replaces it;
 objects stand or move along paths. The Gymnasium environments and the robot server both run on it. Poses are in
@@ -102,10 +102,10 @@ class URSimulation:
     # -- of a real arm's mirror
 
     stopped_by: str | None = None
-    """Why the arm does not move any more, as an episode's final status; a simulated one is never stopped."""
+    """Reason why the arm has stopped, as an episode's final status; a simulated one never stops."""
 
     def robot_info(self) -> dict[str, Any] | None:
-        """Return what a step's info holds of a real robot."""
+        """Return a step's info on a real robot."""
         return None
 
     def take_over(self) -> None:
@@ -113,7 +113,7 @@ class URSimulation:
         raise ValueError("a simulated arm cannot be led by hand")
 
     def limited(self) -> dict[str, int] | None:
-        """Return in how many cycles each limit of a real arm was kept."""
+        """Return the number of cycles in which each limit of a real arm applied."""
         return None
 
     def close(self) -> None:
@@ -139,7 +139,7 @@ class URSimulation:
         self.move_objects({index: np.asarray(position, dtype=np.float64)[None, :]})
 
     def move_objects(self, paths: dict[int, Path]) -> None:
-        """Let objects move along `paths` ((n, 3) [m] in base_link, 100 positions a second, round and round) from now.
+        """Let objects move along `paths` ((n, 3) [m] in base_link, 100 positions a second, repeated) from now.
 
         Call it after `place`, which ends all paths.
         """
@@ -304,7 +304,7 @@ class URSimulation:
         return joints
 
     def tool_at(self, joint_positions: ArrayLike) -> tuple[Vector, Vector]:
-        """Return where tool0 would be in base_link [m] (3,) and its Jacobian [m/rad] (3, 6); nothing moves."""
+        """Return tool0's position at given joints in base_link [m] (3,) and its Jacobian [m/rad] (3, 6)."""
         if self._trial is None:
             self._trial = mujoco.MjData(self.model)
         trial, jacobian = self._trial, np.zeros((3, self.model.nv))

@@ -36,7 +36,7 @@ Vector = NDArray[np.float64]
 
 
 class RobotMode(IntEnum):
-    """RTDE's `robot_mode`, as far as it happens here."""
+    """RTDE's `robot_mode`, as far as it is simulated."""
 
     POWER_OFF = 3
     IDLE = 5
@@ -44,7 +44,7 @@ class RobotMode(IntEnum):
 
 
 class SafetyMode(IntEnum):
-    """RTDE's `safety_mode`, as far as it happens here."""
+    """RTDE's `safety_mode`, as far as it is simulated."""
 
     NORMAL = 1
     PROTECTIVE_STOP = 3
@@ -230,7 +230,7 @@ class Controller:
             self.safety_mode, self.robot_mode = SafetyMode.NORMAL, RobotMode.RUNNING
 
     def unlock_protective_stop(self) -> bool:
-        """End a protective stop that is five seconds old; return whether there is none any more."""
+        """End a protective stop that is five seconds old; return whether the arm is free of it."""
         if self.safety_mode == SafetyMode.PROTECTIVE_STOP:
             if self.time_s - self._stopped_at_s < UNLOCK_S:
                 return False

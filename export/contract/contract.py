@@ -63,7 +63,7 @@ class Distribution(FrozenModel):
         "diag_gaussian for a box, categorical or multi_categorical for the others"
     )
     transform: Literal["none", "unsquash", "clip"] = Field(
-        description="What RLlib does to a sample before env.step: 'unsquash' maps [-1, 1] to the bounds and clips, "
+        description="Transform of a sample before env.step: 'unsquash' maps [-1, 1] to the bounds and clips, "
         "'clip' only clips, 'none' sends it as it is (discrete actions: adds the space's start). Box leaves that are "
         "not bounded on all sides are never unsquashed"
     )

@@ -51,7 +51,7 @@ async def over_aio(url: str, obs: Any) -> dict[str, Any]:
 
 
 def as_perf_analyzer_asks(client: Any, obs: Any) -> dict[str, Any]:
-    """What it asks, in its order: the model, how it is run, and its counts before and after the requests."""
+    """Its requests, in order: the model, how it is run, and its counts before and after the requests."""
     model, config = client.get_model_metadata(MODEL, "2"), client.get_model_config(MODEL, "2")
     before = client.get_inference_statistics(MODEL, "2")
     for _ in range(3):

@@ -3,7 +3,7 @@
 python triton_sequences.py HTTP_HOST:PORT GRPC_HOST:PORT MODEL KEY < {"obs": [[...], ...]}
 
 prints the actions, as JSON.
-Every way plays two sequences in turns; the second one starts a step later, and sees the observations backwards.
+Every way plays two interleaved sequences; the second one starts a step later, and sees the observations backwards.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ SECRETS = ("secrets/tls_key", "secrets/redis_password", "kuberay/secrets.yaml", 
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """What an operator's checkout has after docs/how-to/ray-and-kubernetes.md, as far as `deploy` goes."""
+    """An operator's checkout after docs/how-to/ray-and-kubernetes.md, as far as `deploy` goes."""
     ignore = shutil.ignore_patterns("__pycache__", "secrets", "secrets*.yaml")
     shutil.copytree(ROOT / "deploy", tmp_path / "deploy", ignore=ignore)
     for name in (*SECRETS, "kuberay/secrets.example.yaml", "compose/tls.pem"):

@@ -23,7 +23,7 @@ EMPTY, AVOIDANCE = "rlservo/EmptyEnvironmentURSim-v0", "rlservo/BasicAvoidanceUR
 BOTH = pytest.mark.parametrize("env_id", [EMPTY, AVOIDANCE])
 LIMITS = np.array([2 * math.pi, 2 * math.pi, math.pi, 2 * math.pi, 2 * math.pi, 2 * math.pi])
 AVOIDANCE_START = np.array([-1.57, -1.31, -1.31, -2.18, 1.57, 0.0])
-FAR = [0.0, 0.9, 1.0]  # an object that is in nobody's way
+FAR = [0.0, 0.9, 1.0]  # an object that is not in the way
 
 
 def empty(**arguments: Any) -> EmptyEnvironmentURSim:

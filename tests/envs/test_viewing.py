@@ -152,7 +152,7 @@ def test_observations_show_the_robot_as_it_was(name: str) -> None:
     if target is None or shown_target is None:
         assert np.allclose(shown.robot_position(), env.robot_position(), atol=1e-5)
         return
-    # A MiR100's observations tell where it is relative to its target, and heading only since the episode began.
+    # A MiR100's observations hold its position relative to its target, and heading only since the episode began.
     distance = np.linalg.norm(env.robot_position() - target)
     tolerance = 0.02 if name.startswith("Sparse") else 1e-4
     assert np.linalg.norm(shown.robot_position() - shown_target) == pytest.approx(distance, abs=tolerance)

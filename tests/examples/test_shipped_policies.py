@@ -227,7 +227,7 @@ def test_what_becomes_of_distances_and_direction_is_part_of_the_checkpoint(train
 
 @pytest.fixture
 def penalties(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
-    """Makes a learner with such settings, whose loss without them is 1, and whose network answers as told."""
+    """Makes a learner with such settings, whose loss without them is 1, and whose network gives fixed outputs."""
     monkeypatch.syspath_prepend(EXAMPLES)
     train_shipped = load("train_shipped")
     base = train_shipped.PPOTorchLearner
@@ -327,7 +327,7 @@ def test_a_share_of_the_episodes_begins_as_one_that_failed_until_it_succeeds(mon
         assert is_ordinary == (before == 0) and before <= (2 if episode % 2 == 0 else 0), number
     assert 300 <= sum(ordinary) <= 400 and max(map(seeds.count, seeds)) == 3
     again = {seed for seed in seeds if seeds.count(seed) > 1}
-    assert {seed % 4 for seed in again} == {0, 2}  # what ran out of time failed, too
+    assert {seed % 4 for seed in again} == {0, 2}  # those that ran out of time failed as well
     assert episodes(env, 8)[0] != seeds
     env.unwrapped.seeds.clear()
     env.unwrapped.targets.clear()

@@ -27,7 +27,7 @@ def one_torch_thread() -> Iterator[None]:
 
 @pytest.fixture
 def notices() -> list[str]:
-    """What an export told its user: give it as `notify=notices.append`."""
+    """The notices of an export: give it as `notify=notices.append`."""
     return []
 
 
@@ -39,7 +39,7 @@ def app() -> Path:
 
 @pytest.fixture
 def exported_copy(exported: Callable[..., ExportResult], tmp_path: Path) -> Callable[[Path], ExportResult]:
-    """Return a function that gives a checkpoint's export, as `exported`, where a test may write to its files."""
+    """Return a function that gives a checkpoint's export, as `exported`, for a test that writes to its files."""
 
     def copy(checkpoint: Path) -> ExportResult:
         from rlservo.export.export_checkpoint import ExportResult

@@ -253,7 +253,7 @@ class Process:
 
 @pytest.fixture(scope="module")
 def alone(zoo: Path, old_zoo: Path, app: Path, tmp_path_factory: pytest.TempPathFactory) -> Process:
-    """What EXPORTS found, and the folders that it had."""
+    """The result of EXPORTS, and its folders."""
     home, empty = tmp_path_factory.mktemp("home"), tmp_path_factory.mktemp("empty")
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", EXPORTS, *map(str, (zoo, old_zoo, app, empty))],

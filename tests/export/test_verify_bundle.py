@@ -27,7 +27,7 @@ from rlservo.export.verify_bundle import verify_bundle
 
 @pytest.fixture
 def toy(app: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The user's environment, registered with Gymnasium; its class tells what its elements are called."""
+    """The user's environment, registered with Gymnasium; its class names its elements."""
     monkeypatch.syspath_prepend(str(app))
     gymnasium.register("zoo/Toy-v0", entry_point="zoo_parts:Toy")
     yield "zoo/Toy-v0"

@@ -160,7 +160,7 @@ def test_every_replica_of_a_cluster_follows_the_plan_of_the_repository(cluster: 
     headers = {"authorization": f"Bearer {KEY}"}
 
     def candidates() -> dict[str, str | None]:
-        """What each replica says where the alias leads, by its name."""
+        """The version that the alias points to by each replica, by its name."""
         found: dict[str, str | None] = {}
         deadline = time.monotonic() + 60
         while len(found) < 2:

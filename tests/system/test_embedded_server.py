@@ -29,7 +29,7 @@ PATIENCE_S = 120  # [s] on a busy machine
 def test_arguments_and_bundles_are_checked_before_anything_starts(
     policies: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("RLSERVO_PLAN", str(tmp_path / "plan"))  # the folder of policies is other tests', too
+    monkeypatch.setenv("RLSERVO_PLAN", str(tmp_path / "plan"))  # other tests share the folder of policies
     (port,) = free_ports(1)
     with pytest.raises(BundleError, match="does not exist"):
         serve_policies([tmp_path / "nowhere"], port=port)

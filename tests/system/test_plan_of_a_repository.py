@@ -1,4 +1,4 @@
-"""Two servers with two workers each, and operators, over one repository: who follows, who is told, a killed worker."""
+"""Two servers with two workers each, and operators, over one repository: following, conflicts, a killed worker."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def commands(language: str = "sh") -> list[str]:
 
 @pytest.fixture(scope="module")
 def url(shipped_server: ShippedServer) -> str:
-    """Where the shipped policies for robo-gym's tasks are served."""
+    """The server of the shipped policies for robo-gym's tasks."""
     return shipped_server.url
 
 
@@ -360,7 +360,7 @@ def test_policy_that_ships_needs_the_frame_of_the_documents_commands(
 def test_the_cockpit_shows_the_robot_that_robo_gyms_environment_drives(
     robo_gym_python: Path, light_client: Path, url: str
 ) -> None:
-    """And robo-gym's environment goes through its episodes as if nobody looked."""
+    """And robo-gym's environment goes through its episodes undisturbed."""
     pytest.importorskip("viser", reason="the cockpit draws with viser")
     from rlservo.deploy.cockpit.watch import WatchPanel
 

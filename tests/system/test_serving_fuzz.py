@@ -1,4 +1,4 @@
-"""Bodies, frames and messages nobody meant to send, at the real thing: errors have a name, and nothing hangs.
+"""Malformed bodies, frames and messages against a real server: errors have a name, and nothing hangs.
 
 Seeded and bounded; RLSERVO_FUZZ=20 sends twenty times as much, RLSERVO_FUZZ_SEED changes what.
 """
@@ -48,7 +48,7 @@ NAMES = ["obs", "inputs", "outputs", "parameters", "seed", "seq", "explore", "de
 
 @pytest.fixture(autouse=True)
 def well_afterwards(live_server: Any) -> Iterator[None]:
-    """Whatever was sent, the server goes on, and its log holds no traceback."""
+    """The server continues after anything, and its log holds no traceback."""
     yield
     connection = http.client.HTTPConnection("127.0.0.1", live_server.port, timeout=SLOWEST_S)
     connection.request(
@@ -144,7 +144,7 @@ def test_what_is_not_http_at_all(live_server: Any) -> None:
             client = socket.create_connection(("127.0.0.1", live_server.port), timeout=SLOWEST_S)
             clients.append(stack.enter_context(client))
             client.sendall(mutate(rng, good) + b'{"obs":1}')
-        answers = [client.recv(4096) for client in clients]  # all of them: a request half sent is ended, too
+        answers = [client.recv(4096) for client in clients]  # all of them: a half-sent request also ends
     statuses = {int(answer[9:12]) for answer in answers if answer}
     assert statuses and max(statuses) < 500 and not any(b"Traceback" in answer for answer in answers), statuses
 

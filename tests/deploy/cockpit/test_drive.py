@@ -77,7 +77,7 @@ def test_paused_time_stands_still_but_for_a_step(drives: Callable[..., Drive]) -
     drive.do(drive.step)
     wait_for(lambda: drive.history[-1].number == cycles + 1, "one cycle")
     drive.drag_target(REACHABLE)
-    wait_for(lambda: np.allclose(drive.view.after.target, REACHABLE), "the target moves all the same")
+    wait_for(lambda: np.allclose(drive.view.after.target, REACHABLE), "the target moves nevertheless")
     assert drive.view.phase == "paused" and drive.history[-1].number == cycles + 1
 
 

@@ -230,7 +230,7 @@ def test_the_plots_move_and_the_table_tells_what_the_policy_sees(drive: Drive, w
     text = window.text()
     assert "rad/s" in text and "±1.1" in text and " ± " in text
     table, panel = window.page.evaluate(RIGHT_EDGES)
-    assert table <= panel  # the last column, too
+    assert table <= panel  # the last column as well
     window.click("Plots", role="tab")
 
 
@@ -261,7 +261,7 @@ def test_a_second_browser_may_watch_on_a_phone_and_go(
     # The sheet with the panels covers three fifths of the screen: what the camera looks at is above it.
     top = 0.4 * 844
     line = phone.page.get_by_text("frames/s").first
-    sheet = wait_for(line.bounding_box, "the line is there, which is drawn anew twice a second")
+    sheet = wait_for(line.bounding_box, "the line is there, which is redrawn twice a second")
     assert sheet["y"] > top
     camera = cockpit.server.get_clients()[max(cockpit.server.get_clients())].camera
     view = drive.view

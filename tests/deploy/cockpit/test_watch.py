@@ -1,4 +1,4 @@
-"""The cockpit beside a robot server that somebody else drives: it shows, and changes nothing."""
+"""The cockpit on a robot server that another client drives: it shows, and changes nothing."""
 
 from __future__ import annotations
 

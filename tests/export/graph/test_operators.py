@@ -44,11 +44,11 @@ class Operator:
     ulps: float = 0.0
     """In float32's units in the last place; 0 is bit by bit, the signs of zeros too."""
     atol: float = 0.0
-    """Beside it, where a result near zero is the difference of larger numbers."""
+    """Absolute, for a result near zero that is the difference of larger numbers."""
     degree: int = 0
     """Sums of products of so many elements round with their largest term, of which this gives the size."""
     zeros: bool = True
-    """Whether the two zeros are told apart."""
+    """Whether the two zeros are distinguished."""
     infinite: bool = True
     """Whether infinity, which no observation is, but a division inside a connector may give, is tried as well."""
     limit: float = math.inf
@@ -297,7 +297,7 @@ OPERATORS: dict[str, Operator] = {
     "rsqrt": rounded(of_each(torch.rsqrt)),
 }
 SINGLE_ONLY = {"wrap_atan2", "tan", "hyperbolic"}
-"""Where a double's last bits decide (acosh near 1), and the graph has only single precision's."""
+"""Cases in which a double's last bits decide (acosh near 1), and the graph has only single precision's."""
 
 
 class Untouched(nn.Module):

@@ -1,4 +1,4 @@
-"""The batched connectors beside RLlib's own: what a runner samples, and what it keeps."""
+"""The batched connectors against RLlib's own: samples and state of a runner."""
 
 from __future__ import annotations
 

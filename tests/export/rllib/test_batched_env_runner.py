@@ -1,4 +1,4 @@
-"""The batched connectors' env runner beside RLlib's own: episodes, callbacks, failures, timers."""
+"""The batched connectors' env runner against RLlib's own: episodes, callbacks, failures, timers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ gymnasium.register("Slippery-v0", Slippery)
 
 
 def runner(kind: type, config: Any | None = None, env: str = "CartPole-v1") -> Any:
-    """Return a runner of either kind with the batched connectors, and everything that is random begun anew."""
+    """Return a runner of either kind with the batched connectors, with fresh random state."""
     config = config or PPOConfig()
     config.environment(env).env_runners(num_env_runners=0, num_envs_per_env_runner=2, env_runner_cls=kind)
     use_batched_connectors(config.debugging(seed=3), observation_filter=True)

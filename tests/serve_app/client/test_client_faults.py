@@ -51,7 +51,7 @@ Answer = Callable[["Handler", dict[str, Any]], None]
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Serves the contract; every `act` takes the next answer of the script, the last one for ever."""
+    """Serves the contract; every `act` takes the next answer of the script, the last one repeatedly."""
 
     protocol_version = "HTTP/1.1"
     server: Scripted

@@ -1,4 +1,4 @@
-"""A promotion on a real server in this process: what becomes of good, bad and sabotaged canaries."""
+"""A promotion on a real server in this process: the outcome of good, bad and sabotaged canaries."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Server:
     replica: str = "only"
     app: Any = None
     lie: Callable[[str], str | None] | None = None
-    """Changes the metrics on their way to the promotion; None of it is no answer."""
+    """Changes the metrics on their way to the promotion; None is no answer."""
     numbers: Iterator[int] = field(default_factory=itertools.count)
 
     def restart(self) -> None:
@@ -603,7 +603,7 @@ def test_a_key_that_is_revoked_leaves_it_unfinished_and_the_way_on_is_said(
     assert outcome.outcome == PROMOTED and outcome.is_finished and server.state == ("2", None, None)
 
 
-# The log, and what goes on from it.
+# The log, and promotions resumed from it.
 
 
 def kill() -> None:
@@ -647,7 +647,7 @@ def test_killed_between_the_decision_and_its_end_it_is_carried_out(
 
 
 class Killed(BaseException):
-    """What no handler sees, as SIGKILL."""
+    """An end that no handler sees, as SIGKILL."""
 
 
 @contextmanager

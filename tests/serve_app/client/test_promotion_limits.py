@@ -74,7 +74,7 @@ def test_answers_within_the_limit_are_not_slow_and_a_limit_between_bounds_is_the
     assert figure(latency(900, 0, 100), p99_s=0.02).is_surely_beyond
     assert not figure(latency(995, 0, 5), p99_s=0.02).is_beyond
     assert not figure(latency(1, 0, 1), p99_s=0.02).is_surely_beyond
-    assert figure(latency(500, 0, 0), p99_s=0.001).is_surely_beyond  # faster than the server can tell
+    assert figure(latency(500, 0, 0), p99_s=0.001).is_surely_beyond  # faster than the server can measure
     assert figure({}, p99_s=0.02).lacks
 
 

@@ -45,7 +45,7 @@ def test_an_episode_comes_once_as_soon_as_it_has_ended(ur5: Path, tmp_path: Path
     with Recorder(tmp_path) as recorder, WithRecording(Policy.load(ur5), recorder) as policy:
         act(policy, 3, ends=True)
         policy.reset()
-        act(policy, 2, ends=False)  # goes on below, in a file that was read in between
+        act(policy, 2, ends=False)  # continues below, in a file that was read in between
         first = polled(followed, 1)
         act(policy, 4, ends=True)
         second = polled(followed, 1)

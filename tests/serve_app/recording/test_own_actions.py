@@ -29,7 +29,7 @@ def box(low: Any, high: Any, dtype: str = "float32") -> BoxSpec:
 
 
 def send_by_rllib(own: np.ndarray[Any, Any], transform: Transform, leaf: BoxSpec) -> np.ndarray[Any, Any]:
-    """What RLlib's own connector sends for a module's actions."""
+    """RLlib's own connector's output for a module's actions."""
     pytest.importorskip("ray.rllib")
     from ray.rllib.connectors.module_to_env import NormalizeAndClipActions
     from ray.rllib.core.columns import Columns

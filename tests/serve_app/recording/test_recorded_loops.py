@@ -30,7 +30,7 @@ from stores import load_store
 
 
 class Countdown(gym.Env[Any, Any]):
-    """Ten steps of the ur5 bundle's shape, in one buffer that is written anew each step."""
+    """Ten steps of the ur5 bundle's shape, in one buffer that is overwritten each step."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (27,), np.float32)
     high = np.array([1, 1, 1, 2, 1, 1], np.float32)
@@ -126,7 +126,7 @@ def test_client_that_records_nothing_takes_outcomes(url: str) -> None:
 
 
 class Failing:
-    """A policy of which every third answer does not come."""
+    """A policy whose every third answer is missing."""
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy

@@ -369,7 +369,7 @@ def test_folder_rotates_by_time(ur5: Path, tmp_path: Path) -> None:
             time.sleep(0.1)
     assert len(list(tmp_path.iterdir())) >= 2
     (episode,) = episodes(Recording(tmp_path))
-    assert episode.steps.tolist() == list(range(30))  # it goes on from file to file
+    assert episode.steps.tolist() == list(range(30))  # it continues from file to file
 
 
 def test_two_writers_of_one_folder_do_not_meet(ur5: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Estimates cover the truth where they claim to, and say where they cannot."""
+"""Estimates cover the truth if they claim to, and report if they cannot."""
 
 from __future__ import annotations
 

@@ -453,5 +453,5 @@ print(report.steps, report.interrupted, report.control_rate_hz)
     assert done.stdout.split() == ["5", "True", "10.0"]
     frames, log = decode(file, width=640, height=480)
     assert " 10 fps" in log
-    assert len(frames) == 6  # an interrupted film is a whole file, too
+    assert len(frames) == 6  # an interrupted video is still a whole file
     assert frames.std() > 10  # a picture, not a black film

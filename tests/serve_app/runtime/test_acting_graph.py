@@ -83,7 +83,7 @@ def test_nodes_may_come_in_any_order() -> None:
 
 @pytest.mark.trained
 def test_a_large_graph_is_opened_as_it_is(exported: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Making it anew holds the interpreter's lock, in which nobody acts."""
+    """Making it again holds the interpreter's lock, during which no policy acts."""
     folder = exported(SHIPPED).path
     monkeypatch.setattr(loading, "LARGEST_MADE", 1000)
     policy = Policy.load(folder)

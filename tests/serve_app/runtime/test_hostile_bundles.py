@@ -1,4 +1,4 @@
-"""Bundles that somebody made to stop a server, and file systems that hang: refused in a sentence, all else goes on."""
+"""Bundles made to stop a server, and file systems that hang: refused in a sentence while all else continues."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def root(policies: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def patience(request: pytest.FixtureRequest) -> dict[str, float]:
-    """How long the server waits for the file system."""
+    """Time that the server waits for the file system."""
     return {"scan_timeout_s": 60.0, "load_timeout_s": 60.0, **getattr(request, "param", {})}
 
 
@@ -112,7 +112,7 @@ def make(kind: str, file: Path) -> None:
 
 
 def work_goes_on(admin: AdminClient, url: str) -> None:
-    """Whoever acts, and every other command, is answered soon."""
+    """Actions and every other command are answered soon."""
     with httpx.Client(base_url=url, timeout=SOON_S) as robot:
         for command in (
             lambda: admin.alias("ur5", "candidate", "1"),

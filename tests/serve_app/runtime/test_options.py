@@ -49,7 +49,7 @@ def test_an_observation_out_of_bounds_is_refused_clipped_or_used_as_the_options_
     assert (as_it_is.notices, warned.notices, clipped.notices) == ((), (sentence,), (f"{sentence}: clipped",))
     np.testing.assert_array_equal(warned.action, as_it_is.action)
     np.testing.assert_array_equal(clipped.action, accepting.act(np.clip(OUTSIDE, -1, 1)))
-    assert clipping.step(ZEROS).notices == ()  # a step says what it noticed itself, whoever asked before
+    assert clipping.step(ZEROS).notices == ()  # a step reports only its own notices
     with pytest.raises(ObservationError, match=r"element 3 \(element_3\) is 1\.5, outside the .* \[-1, 1\]"):
         refusing.act(OUTSIDE)
     assert [record.getMessage() for record in caplog.records] == [
