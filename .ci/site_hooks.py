@@ -1,34 +1,19 @@
-"""MkDocs hooks: the order of the navigation, the page of the HTTP API, and every public name on its page."""
+"""MkDocs hooks: the order of the navigation, and every public name on its page."""
 
 from __future__ import annotations
 
-import json
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from mkdocs.exceptions import PluginError
 from mkdocs.plugins import event_priority
-from swagger_ui_bundle import swagger_ui_path  # type: ignore[import-untyped]
 
 import rlservo
-from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.settings import ServerSettings
 
 SECTIONS = {"tutorial": "Tutorial", "how-to": "How-to", "reference": "Reference", "explanation": "Explanation"}
 PYTHON_PAGE = "reference/python.md"
 NOT_OBJECTS = {"__version__", "errors"}  # errors has a page of its own
-OPENAPI_PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><title>rlservo API</title>
-<link rel="stylesheet" href="swagger/swagger-ui.css"></head>
-<body><div id="swagger-ui"></div><script src="swagger/swagger-ui-bundle.js"></script><script>
-SwaggerUIBundle({spec: %s, dom_id: "#swagger-ui", validatorUrl: null, supportedSubmitMethods: [],
-  presets: [SwaggerUIBundle.presets.apis], layout: "BaseLayout"});
-</script></body></html>
-"""
-
-
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("envs", "export", "serve_app", "deploy")
 PACKAGE = tempfile.TemporaryDirectory(prefix="rlservo-site-")  # removed with the process
@@ -58,14 +43,3 @@ def on_files(files: Any, config: Any) -> Any:
     if missing:
         raise PluginError(f"{PYTHON_PAGE} does not document {', '.join(missing)}")
     return files
-
-
-def on_post_build(config: Any) -> None:
-    """Write the page of the HTTP API, with the document inside: a page from disk may fetch nothing."""
-    site = Path(config.site_dir)
-    (site / "swagger").mkdir(exist_ok=True)
-    for name in ("swagger-ui.css", "swagger-ui-bundle.js"):
-        shutil.copy(Path(swagger_ui_path) / name, site / "swagger" / name)
-    document = create_app(lambda: None, ServerSettings()).openapi()  # type: ignore[arg-type, attr-defined]
-    text = json.dumps(document).replace("</", "<\\/")
-    (site / "openapi.html").write_text(OPENAPI_PAGE % text, encoding="utf-8")

@@ -270,6 +270,6 @@ def closing_sessions(app: Any) -> Any:
     async def run(scope: Any, receive: Any, send: Any) -> None:
         await app(scope, receive, send)
         if scope["type"] == "lifespan":
-            await app.state.handler.close()
+            await app.handler.close()
 
     return run

@@ -133,8 +133,7 @@ def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     pages = list((tmp_path / "site").rglob("*.html"))
-    assert len(pages) > len(list(DOCS.rglob("*.md")))  # and 404, and the API's
-    assert '"/v1/policies/{name}/act"' in (tmp_path / "site" / "openapi.html").read_text()
+    assert len(pages) > len(list(DOCS.rglob("*.md")))  # and 404
     fetched = {
         url
         for page in pages

@@ -15,7 +15,6 @@ import time
 from collections.abc import Awaitable, Iterable
 from typing import Any, cast
 
-from starlette.types import Receive, Scope, Send
 from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -25,6 +24,7 @@ from rlservo.export.contract.errors import DeadlineError, OverloadedError, Reque
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
 LIMITS = "rlservo.limits"  # in the application's lifespan state, which uvicorn hands to each connection
 HEAD_S = 5.0  # [s] for a request's head, from the connection's start or the head's first byte

@@ -23,7 +23,6 @@ from types import FrameType
 from typing import Any
 
 import uvicorn
-from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.supervisors import Multiprocess
 
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
@@ -44,6 +43,7 @@ from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.serving_plan import ServedConfig
+from rlservo.serve_app.wire.asgi import ASGIApp, Receive, Scope, Send
 from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)

@@ -43,7 +43,7 @@ class Serving:
             is_alone=is_alone,
             is_behind_serve=is_behind_serve,
         )
-        self.handler = self.app.state.handler
+        self.handler = self.app.handler
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self, served: Any) -> None:

@@ -1,46 +1,43 @@
-"""Route and checks of every HTTP connection, then body and reply of a request for actions.
+"""Route and checks of every connection, then body and reply of a request for actions.
 
-FastAPI's middleware, dependencies and responses cost more than a policy does, so `PolicyApp` answers requests for
-actions by a `HttpEndpoint`: a bare ASGI callable with the protocol's codec. Everything runs in the event loop: a
-decision takes microseconds, a hop to a thread takes more.
+Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more.
 """
 
 from __future__ import annotations
 
 import asyncio
 import itertools
+import logging
 import secrets
 import time
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
-
-from fastapi import FastAPI
-from starlette.routing import BaseRoute, Match
-from starlette.types import Message, Receive, Scope, Send
 
 from rlservo.export.contract.errors import (
     ForbiddenError,
+    InternalError,
     RateLimitError,
     RequestError,
     RlservoError,
     UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.request import ClientGoneError, Request
-from rlservo.serve_app.protocols.action_routes import PostRoute, StreamRoute
 from rlservo.serve_app.protocols.http_errors import (
+    JSON_HEADERS,
     Headers,
+    encode_bug,
     error_answer,
-    http_error,
+    missing_route,
     refuse_upgrade,
     send_error,
+    send_reply,
     too_large,
 )
+from rlservo.serve_app.protocols.routes import WEBSOCKET, Answer, Call, Found, RoutingTable
 from rlservo.serve_app.server.access_checks import (
     HEADERS,
     LABEL,
     MAY_EXPLORE,
-    PATH,
     REPLY_HEADERS,
     REQUEST_ID,
     AccessChecks,
@@ -48,13 +45,14 @@ from rlservo.serve_app.server.access_checks import (
     fold_headers,
     header_text,
 )
-from rlservo.serve_app.server.api_keys import Access, Key, access_of
-from rlservo.serve_app.server.audit import AUDIT, AuditEntry
+from rlservo.serve_app.server.api_keys import Access, Key
+from rlservo.serve_app.server.audit import AuditEntry
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
+from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
-PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
+logger = logging.getLogger(__name__)
+
 HANG_UP_TURNS = 4
-ROOT = "/"  # a page for browsers (`status_page.py`), nothing for programs
 
 Body = bytes | bytearray
 
@@ -62,37 +60,24 @@ PROCESS = secrets.token_hex(8).encode()
 numbers = itertools.count(1)
 
 
-class Found(NamedTuple):
-    """A route and the parameters in its path; where only the path fits, FastAPI answers 404 or 405."""
-
-    route: BaseRoute | None
-    access: Access
-    params: dict[str, str]
-    fits: bool = True  # the method, too
-
-
-class PolicyApp(FastAPI):
-    """A FastAPI application whose routes say who may use them, decided before anything of the body is read.
-
-    `find` is the one routing table. Routes for actions and streams (`PostRoute`, `StreamRoute`) are bare ASGI callables
-    and are answered here, since FastAPI's middleware and router cost as much again as the request does; FastAPI runs
-    the others.
-    """
+class PolicyApp:
+    """The ASGI application: finds each connection's route, and checks who asks before anything of the body is read."""
 
     def __init__(
-        self, handler: RequestHandler, checks: AccessChecks, *, is_behind_serve: bool = False, **options: Any
+        self, handler: RequestHandler, checks: AccessChecks, table: RoutingTable, *, is_behind_serve: bool = False
     ) -> None:
         """`is_behind_serve`: Ray Serve gives replies their request id, and its connections take trailers for headers"""
-        super().__init__(**options)
-        self._handler = handler
+        self.handler = handler
+        self.table = table
         self._checks = checks
         self._is_behind_serve = is_behind_serve
-        self._found: dict[tuple[str, str], Found] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one ASGI connection."""
-        if scope["type"] == "lifespan":
-            await super().__call__(scope, receive, send)
+        if scope["type"] == "lifespan":  # an engine loads the policies
+            for phase in ("startup", "shutdown"):
+                await receive()
+                await send({"type": f"lifespan.{phase}.complete"})
             return
         path, headers = route_path(scope), fold_headers(scope["headers"])
         request_id = headers.get(REQUEST_ID)
@@ -100,91 +85,77 @@ class PolicyApp(FastAPI):
             request_id = headers[REQUEST_ID] = b"%s-%x" % (PROCESS, next(numbers))
         scope[HEADERS] = headers
         scope[REPLY_HEADERS] = () if self._is_behind_serve else ((REQUEST_ID, request_id),)
-        found = self.find(scope, path)
-        if not (found.fits and isinstance(found.route, PostRoute | StreamRoute)):
-            await self._answer_by_fastapi(found, path, headers, scope, receive, send)
+        method = scope["method"] if scope["type"] == "http" else WEBSOCKET
+        found = self.table.find(method, path, headers.get(b"accept", b""))
+        if found.route is None or found.route.app is None:
+            await self._answer(found, path, scope, receive, send)
             return
         try:
-            key = self._check(found, path, headers, scope)
+            key = self._check(found, path, scope)
         except RlservoError as error:
-            await self._refuse(scope, headers, receive, send, error)
+            await self._refuse(scope, receive, send, error)
             return
         scope["path_params"] = found.params
         scope[MAY_EXPLORE] = key is None or key.may_explore
         await found.route.app(scope, receive, send)
 
-    async def _answer_by_fastapi(
-        self, found: Found, path: str, headers: dict[bytes, bytes], scope: Scope, receive: Receive, send: Send
-    ) -> None:
+    async def _answer(self, found: Found, path: str, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer where there is no route, or one that wants the whole body."""
+        headers = scope[HEADERS]
         entry = AuditEntry(scope.get("method", ""), path, peer_of(scope), header_text(headers, REQUEST_ID))
         entry.is_administration = found.access is Access.admin
-        scope[AUDIT] = entry
+        own: Headers
         try:
-            key = self._check(found, path, headers, scope)
+            key = self._check(found, path, scope)
             entry.key = "" if key is None else key.label
             if scope["type"] == "websocket":
-                sentence = f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream"
-                await _send_refusal(scope, receive, send, UnknownPolicyError(sentence))
-                return
-            if found.route is None:
-                varying = {"Vary": "Accept"} if path == ROOT else None
-                await http_error(404, scope, headers=varying)(scope, receive, send)
-                return
-            body = await receive_body(self._handler, headers, receive)
-            await super().__call__(scope, replay(body, receive), with_headers(send, scope[REPLY_HEADERS]))
+                raise UnknownPolicyError(f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream")
+            if found.route is None or found.route.answer is None:
+                status, entry.code, content, own = missing_route(entry.method, path, found.allowed)
+            else:
+                body = await receive_body(self.handler, headers, receive)
+                call = Call(found.params, headers, bytes(body), entry)
+                status, content, own = await _reply_of(found.route.answer, call)
+            await send_reply(send, status, content, own + scope[REPLY_HEADERS])
         except RlservoError as error:
             entry.code = error.code
             if isinstance(error, ForbiddenError | RateLimitError):
                 entry.key = entry.key or error.key
-            await self._refuse(scope, headers, receive, send, error)
+            await self._refuse(scope, receive, send, error)
         except ClientGoneError:
             return
         finally:
             entry.write()
 
-    def _check(self, found: Found, path: str, headers: dict[bytes, bytes], scope: Scope) -> Key | None:
+    def _check(self, found: Found, path: str, scope: Scope) -> Key | None:
         """Return the key that opens a route. Raises what `check_path` and `AccessChecks.check` raise."""
         check_path(scope, path)
-        key = self._checks.check(scope, headers, found.access)
-        if self._is_behind_serve and b"transfer-encoding" in headers:
+        key = self._checks.check(scope, scope[HEADERS], found.access)
+        if self._is_behind_serve and b"transfer-encoding" in scope[HEADERS]:
             raise RequestError("a chunked body is not accepted behind Ray Serve: send Content-Length")
         return key
 
-    async def _refuse(
-        self, scope: Scope, headers: Mapping[bytes, bytes], receive: Receive, send: Send, error: RlservoError
-    ) -> None:
+    async def _refuse(self, scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
+        headers, own = scope[HEADERS], scope[REPLY_HEADERS]
         request = Request(scope["type"], "", None, time.perf_counter(), request_id=header_text(headers, REQUEST_ID))
-        self._handler.record_failure(request, error.code, error.message, peer=peer_of(scope))
-        await _send_refusal(scope, receive, send, error)
+        self.handler.record_failure(request, error.code, error.message, peer=peer_of(scope))
+        if scope["type"] == "http":
+            await send_error(send, error, headers=own)
+        else:
+            await refuse_upgrade(scope, receive, send, error, own)
 
-    def find(self, scope: Scope, path: str) -> Found:
-        """Return the route of a connection.
 
-        A path with another method is guarded as its most guarded route is; one without any is for any key.
-        """
-        kind = scope["method"] if scope["type"] == "http" else "WEBSOCKET"
-        known = self._found.get((kind, path))
-        if known is not None:
-            return known
-        others: list[BaseRoute] = []
-        for route in self.router.routes:
-            match, below = route.matches(scope)
-            if match is Match.FULL:
-                found = Found(route, access_of(route), below.get("path_params", {}))
-                # Only these match by method and path alone: the page at `/` asks the Accept header, too.
-                is_bare = isinstance(route, PostRoute | StreamRoute)
-                if is_bare and len(path) <= LONGEST_REMEMBERED and PATH.fullmatch(path) is not None:
-                    if len(self._found) >= PATHS_REMEMBERED:
-                        self._found.clear()
-                    self._found[kind, path] = found
-                return found
-            if match is Match.PARTIAL:
-                others.append(route)
-        if not others:
-            return Found(None, Access.act, {}, fits=False)
-        levels = {access_of(route) for route in others}
-        access = next(level for level in (Access.admin, Access.act, Access.open) if level in levels)
-        return Found(others[0], access, {}, fits=False)
+async def _reply_of(answer: Answer, call: Call) -> tuple[int, bytes, Headers]:
+    """Return (status, body, headers), errors included."""
+    try:
+        return 200, *await answer(call)
+    except RlservoError as error:
+        call.audit.code = error.code
+        return error_answer(error)
+    except Exception:
+        logger.exception("a request failed")
+        call.audit.code = InternalError.code
+        return 500, encode_bug(), JSON_HEADERS
 
 
 class HttpEndpoint:
@@ -218,10 +189,7 @@ class HttpEndpoint:
             status, content, reply_headers = error_answer(error)
         except ClientGoneError:
             return
-        length = (b"content-length", b"%d" % len(content))
-        every = [length, *reply_headers, *scope[REPLY_HEADERS]]
-        await send({"type": "http.response.start", "status": status, "headers": every})
-        await send({"type": "http.response.body", "body": content})
+        await send_reply(send, status, content, reply_headers + scope[REPLY_HEADERS])
 
 
 async def has_hung_up(receive: Receive) -> bool:
@@ -261,35 +229,6 @@ async def receive_body(handler: RequestHandler, headers: Mapping[bytes, bytes], 
     if len(body) > max_bytes:
         raise too_large(max_bytes)
     return body
-
-
-async def _send_refusal(scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
-    headers = scope.get(REPLY_HEADERS, ())
-    if scope["type"] == "http":
-        await send_error(send, error, headers=headers)
-    else:
-        await refuse_upgrade(scope, receive, send, error, headers)
-
-
-def replay(body: Body, receive: Receive) -> Receive:
-    """Return a `receive` that gives a body that has been read, and then what else comes."""
-    messages: list[Message] = [{"type": "http.request", "body": bytes(body), "more_body": False}]
-
-    async def receive_again() -> Message:
-        return messages.pop() if messages else await receive()
-
-    return receive_again
-
-
-def with_headers(send: Send, headers: Headers) -> Send:
-    """Return a `send` that adds headers to the reply."""
-
-    async def send_with_headers(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            message["headers"] = [*message.get("headers", ()), *headers]
-        await send(message)
-
-    return send_with_headers
 
 
 def route_path(scope: Scope) -> str:

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
-
-from starlette.responses import Response
-from starlette.types import Receive, Scope, Send
 
 from rlservo.export.contract.errors import (
     ActionError,
@@ -28,8 +25,9 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UnknownPolicyError,
 )
-from rlservo.serve_app.protocols import json_messages
+from rlservo.serve_app.protocols.json_text import encode_json
 from rlservo.serve_app.server.request_handler import BUG
+from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
 logger = logging.getLogger(__name__)
 
@@ -52,14 +50,6 @@ STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; w
     (ForbiddenError, 403),
     (ActionError, 500),
 )
-CODES = {
-    404: "not-found",
-    405: "method-not-allowed",
-    413: "too-large",
-    415: "wrong-media-type",
-}  # where FastAPI decides
-OTHER = "http-error"
-ANY_ROUTE = (400, 401, 403, 408, 413, 429)  # its path, key, host, page, body and rate
 RETRY_AFTER_S = 1
 JSON = b"application/json"
 Headers = tuple[tuple[bytes, bytes], ...]
@@ -105,31 +95,55 @@ def encode_error(error: RlservoError) -> bytes:
     document: dict[str, Any] = {"error": error.message, "code": error.code}
     if error.details:
         document["details"] = error.details
-    return json_messages.encode_json(document)
+    return encode_json(document)
 
 
 def encode_bug() -> bytes:
     """Return the body of an error that is none of ours to explain to a client."""
-    return json_messages.encode_json({"error": BUG, "code": "internal"})
+    return encode_json({"error": BUG, "code": "internal"})
 
 
-def http_error(status: int, scope: Scope, *, detail: str = "", headers: Mapping[str, str] | None = None) -> Response:
-    """Return the answer where no route of ours has decided."""
-    path, headers = scope["path"][:200], headers or {}
-    sentences = {
-        404: f"nothing is at {path}: policies are under /v1/policies, documentation at /docs",
-        405: f"{scope['method']} is not what {path} takes: {headers.get('Allow', 'another method')} is",
-    }
-    document = {"error": sentences.get(status, detail), "code": CODES.get(status, OTHER)}
-    return Response(json_messages.encode_json(document), status, headers, "application/json")
+def missing_route(method: str, path: str, allowed: Sequence[str]) -> tuple[int, str, bytes, Headers]:
+    """Return (status, code, body, headers) where no route has the path, or only for the `allowed` methods."""
+    shown, headers = path[:200], JSON_HEADERS
+    if allowed:
+        status, code, sentence = 405, "method-not-allowed", f"{method} is not what {shown} takes: {allowed[0]} is"
+        headers += ((b"allow", ", ".join(allowed).encode()),)
+    else:
+        status, code, sentence = 404, "not-found", f"nothing is at {shown}: policies are under /v1/policies"
+        if path == "/":  # a page for browsers
+            headers += ((b"vary", b"Accept"),)
+    return status, code, encode_json({"error": sentence, "code": code}), headers
+
+
+def check_media_type(headers: Mapping[bytes, bytes], *accepted: bytes, optional: bool = False) -> None:
+    """Raise MediaTypeError unless the body is of an accepted content type.
+
+    A web page can send forms, plain text and bodies of no type to any server; for another type a browser asks the
+    server first. Triton's client names no type: `optional` lets through who does not, unless it is a browser.
+    """
+    given = headers.get(b"content-type")
+    usage = f"send {accepted[0].decode()} (curl: -H 'content-type: {accepted[0].decode()}')"
+    if given is None:
+        if not optional or b"origin" in headers or b"sec-fetch-site" in headers:
+            raise MediaTypeError(f"the request has no content type: {usage}")
+    elif given not in accepted and given.split(b";", 1)[0].strip().lower() not in accepted:
+        raise MediaTypeError(f"the content type is '{given[:64].decode('latin-1')}': {usage}")
+
+
+async def send_reply(
+    send: Send, status: int, content: bytes, headers: Iterable[tuple[bytes, bytes]], *, kind: str = "http.response"
+) -> None:
+    """Send a whole reply; `kind` is the ASGI messages'."""
+    every = [(b"content-length", b"%d" % len(content)), *headers]
+    await send({"type": f"{kind}.start", "status": status, "headers": every})
+    await send({"type": f"{kind}.body", "body": content})
 
 
 async def send_error(send: Send, error: RlservoError, *, kind: str = "http.response", headers: Headers = ()) -> None:
-    """Answer with an error; `kind` is the ASGI messages', `headers` are further ones."""
+    """Answer with an error; `headers` are further ones."""
     status, content, own = error_answer(error)
-    every = [(b"content-length", b"%d" % len(content)), *own, *headers]
-    await send({"type": f"{kind}.start", "status": status, "headers": every})
-    await send({"type": f"{kind}.body", "body": content})
+    await send_reply(send, status, content, own + headers, kind=kind)
 
 
 async def refuse_upgrade(
@@ -151,8 +165,3 @@ async def fail_stream(send: Send, content: bytes) -> None:
         await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
     except (OSError, RuntimeError):  # the client has gone meanwhile
         logger.debug("a stream's client went before its error could be sent")
-
-
-def error_models(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return FastAPI's `responses` for these error statuses, and for those that every route may answer with."""
-    return {status: {"model": json_messages.ErrorReply} for status in sorted({*ANY_ROUTE, *statuses})}

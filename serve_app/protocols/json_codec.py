@@ -13,8 +13,8 @@ from itertools import islice
 from typing import Any
 
 import orjson
-from starlette.types import Receive
 
+from rlservo.export.contract.contract import contract_json
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError
 from rlservo.serve_app.episodes.request import (
     EPISODE_FIELDS,
@@ -24,17 +24,38 @@ from rlservo.serve_app.episodes.request import (
     Episode,
     Request,
 )
-from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
-from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers
-from rlservo.serve_app.protocols.json_messages import json_type, parse_json
-from rlservo.serve_app.protocols.media_types import check_media_type
+from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
+from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type
+from rlservo.serve_app.protocols.json_text import encode_json, json_type, parse_json
+from rlservo.serve_app.protocols.routes import GET, POST, Call, Route, of_policy
+from rlservo.serve_app.server import listing
+from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.reply_fields import reply_fields
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.asgi import Receive
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 SUCH_AS = '{"obs": [...]}'
+
+
+def routes(handler: RequestHandler) -> list[Route]:
+    """Return the routes of /v1: actions, and what is served."""
+
+    async def policies(_call: Call) -> tuple[bytes, Headers]:
+        return encode_json(listing.describe(handler)), JSON_HEADERS
+
+    async def contract(call: Call) -> tuple[bytes, Headers]:
+        policy = handler.store().get(call.params["name"], call.params.get("version"))
+        return contract_json(policy.contract).encode(), JSON_HEADERS
+
+    act = HttpEndpoint("json", JsonCodec(handler), handler)
+    return [
+        *of_policy(POST, "/v1/policies", "/act", "Act", app=act),
+        Route(GET, "/v1/policies", Access.act, "Policies and versions served", policies),
+        *of_policy(GET, "/v1/policies", "", "Contract", answer=contract),
+    ]
 
 
 class JsonCodec:

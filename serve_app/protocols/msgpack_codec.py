@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from starlette.types import Message
-
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RequestError, TooLargeError
 from rlservo.export.contract.spaces import DictSpec
@@ -22,6 +20,7 @@ from rlservo.serve_app.server.content_bounds import SMALL, check_length
 from rlservo.serve_app.server.reply_fields import reply_fields
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.asgi import Message
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 IGNORED = frozenset({"prompt", "env_id"})

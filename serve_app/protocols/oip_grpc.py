@@ -36,7 +36,7 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols import oip_config, oip_infer, oip_models
+from rlservo.serve_app.protocols import oip_infer, oip_models
 from rlservo.serve_app.protocols.http_errors import retry_after_s, status_of
 from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, as_datatype, check_form, check_size, datatype_of, from_bytes
@@ -205,13 +205,13 @@ def _model_metadata(handler: RequestHandler, incoming: Incoming) -> Any:
 
 def _model_config(handler: RequestHandler, incoming: Incoming) -> Any:
     message = _parse(messages.ModelConfigRequest, incoming[0])
-    config = oip_config.model_config(handler, message.name, message.version or None)
+    config = oip_models.model_config(handler, message.name, message.version or None)
     return messages.ModelConfigResponse(config=_numbered(config))
 
 
 def _model_statistics(handler: RequestHandler, incoming: Incoming) -> Any:
     message = _parse(messages.ModelStatisticsRequest, incoming[0])
-    found = oip_config.statistics(handler, message.name or None, message.version or None)
+    found = oip_models.statistics(handler, message.name or None, message.version or None)
     return messages.ModelStatisticsResponse(model_stats=found)
 
 

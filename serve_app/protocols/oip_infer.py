@@ -17,22 +17,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import fastapi
 import numpy as np
 import orjson
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
-from starlette.types import Receive
 
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, OPTIONS, Episode, Request, SessionId
-from rlservo.serve_app.protocols.http_endpoint import Body, receive_body
-from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, too_large
+from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
+from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type, too_large
 from rlservo.serve_app.protocols.json_codec import parse_episode, parse_finite, parse_options
-from rlservo.serve_app.protocols.json_messages import json_type, parse_json
-from rlservo.serve_app.protocols.media_types import check_media_type
+from rlservo.serve_app.protocols.json_text import json_type, parse_json
 from rlservo.serve_app.protocols.oip_tensors import (
     DTYPES,
     datatype_of,
@@ -41,12 +37,13 @@ from rlservo.serve_app.protocols.oip_tensors import (
     parse_tensor,
     write_tensor,
 )
+from rlservo.serve_app.protocols.routes import POST, Route, of_policy
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.access_checks import HEADERS
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.reply_fields import reply_fields
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.asgi import Receive
 from rlservo.serve_app.wire.request_names import BELONGS_TO
 
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
@@ -68,42 +65,10 @@ COMPRESSION_LEVEL = 1  # numbers of a robot hardly compress; a control loop wait
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
 
 
-class Tensor(BaseModel):
-    """A tensor, in JSON or (with the parameter `binary_data_size`) as bytes after the JSON."""
-
-    name: str
-    shape: list[int]
-    datatype: str = Field(description="One of " + ", ".join(DTYPES))
-    parameters: dict[str, Any] | None = None
-    data: list[Any] | None = Field(None, description="Nested or flat, in row-major order.")
-
-
-class InferRequest(BaseModel):
-    """Ask for a batch of actions."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    id: str | None = Field(None, description="Echoed.")
-    parameters: dict[str, Any] | None = Field(
-        None,
-        description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
-        "`sequence_end`, `state_policy` (which the reply gave with the states), `binary_data_output`.",
-    )
-    model_name: str | None = Field(None, description="The path's, if given at all.")
-    inputs: list[Tensor]
-    outputs: list[dict[str, Any]] | None = Field(
-        None, description='`[{"name": "action", "parameters": {"binary_data": true}}]` for bytes after the JSON.'
-    )
-
-
-class InferReply(BaseModel):
-    """A batch of actions, ready for the environment's `step`."""
-
-    model_name: str
-    model_version: str
-    id: str | None = None
-    parameters: dict[str, Any]
-    outputs: list[Tensor]
+def routes(handler: RequestHandler) -> list[Route]:
+    """Return the routes of /v2 for actions."""
+    infer = HttpEndpoint("oip", OipHttpCodec(handler), handler)
+    return of_policy(POST, "/v2/models", "/infer", "Infer", app=infer)
 
 
 @dataclass(slots=True)
@@ -483,8 +448,3 @@ def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes,
             headers += ((b"content-encoding", encoding), (b"vary", b"accept-encoding"))
             return stream.compress(content) + stream.flush(), headers
     return content, headers
-
-
-async def accept_media_type(request: fastapi.Request) -> None:
-    """Raise MediaTypeError for what none of the protocol's clients sends: a dependency of routes that FastAPI runs."""
-    check_media_type(request.scope[HEADERS], JSON, BINARY, optional=True)

@@ -75,7 +75,7 @@ _MESSAGES: dict[str, list[str]] = {
     "RepositoryIndexRequest": ["string repository_name", "bool ready"],
     "RepositoryIndexResponse": ["repeated RepositoryIndexResponse.ModelIndex models"],
     "RepositoryIndexResponse.ModelIndex": ["string name", "string version", "string state", "string reason"],
-    # Of Triton's configuration and statistics only what is told here (`oip_config.py`). On the wire an enumeration is
+    # Of Triton's configuration and statistics only what is told here (`oip_models.py`). On the wire an enumeration is
     # an int32: DATA_TYPES has its names.
     "ModelConfigRequest": ["string name", "string version"],
     "ModelConfigResponse": ["ModelConfig config"],
@@ -140,10 +140,6 @@ UNARY = (
     "RepositoryIndex",
 )
 STREAM = "ModelStreamInfer"
-_METHODS = {name: f"{name}Request {name}Response" for name in UNARY}
-_METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
 
-messages: Any = SimpleNamespace(
-    **build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice", services={"GRPCInferenceService": _METHODS})
-)
+messages: Any = SimpleNamespace(**build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice"))
 """The classes by name; those made at run time have no static type. A nested one is an attribute of its outer one's."""

@@ -1,39 +1,42 @@
-"""Open Inference Protocol v2: metadata of server and models, health, and the repository index."""
+"""Open Inference Protocol v2: health, metadata, configuration and statistics of models, and the repository index.
+
+Triton's tools (perf_analyzer, model_analyzer) ask for configuration and statistics before they infer. These documents
+have the fields of Triton's messages ModelConfig and ModelStatistics. A field of theirs that nothing here corresponds to
+is left out, a duration that is not measured is 0. gRPC's messages have the same fields.
+
+Specification: github.com/triton-inference-server/server, docs/protocol/extension_model_configuration.md and
+extension_statistics.md; github.com/triton-inference-server/common, protobuf/model_config.proto.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import orjson
-from fastapi import Depends, FastAPI, Request
-from fastapi.responses import Response
-from pydantic import BaseModel, Field
 
 import rlservo
-from rlservo.export.contract.contract import TensorSpec
-from rlservo.serve_app.protocols.action_routes import PostRoute, post_routes
-from rlservo.serve_app.protocols.fastapi_routes import add_route
-from rlservo.serve_app.protocols.http_endpoint import HttpEndpoint
-from rlservo.serve_app.protocols.http_errors import too_large
-from rlservo.serve_app.protocols.json_messages import parse_json
+from rlservo.export.contract.bundle import ONNX_FILE
+from rlservo.export.contract.contract import REWARD, TensorSpec
+from rlservo.export.contract.errors import RequestError
+from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type, too_large
+from rlservo.serve_app.protocols.json_text import parse_json
 from rlservo.serve_app.protocols.oip_infer import (
-    InferReply,
-    InferRequest,
-    OipHttpCodec,
-    accept_media_type,
+    BINARY,
+    LAST_ACTION,
+    STATE_IN,
+    STATE_OUT,
     offered_inputs,
     offered_outputs,
 )
 from rlservo.serve_app.protocols.oip_tensors import datatype_of, parse_flag
+from rlservo.serve_app.protocols.routes import GET, POST, Call, Route, of_policy
+from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
 from rlservo.serve_app.server.listing import states_of
+from rlservo.serve_app.server.metrics import Totals
 from rlservo.serve_app.server.request_handler import RequestHandler
 
-TAG = "open inference protocol"
-MODEL, VERSION = "/v2/models/{name}", "/v2/models/{name}/versions/{version}"
 PLATFORM = "onnx_onnxv1"
 EXTENSIONS = (
     "binary_tensor_data",
@@ -44,117 +47,63 @@ EXTENSIONS = (
     "statistics",
 )
 STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
+BACKEND = "onnxruntime"
+LARGEST_INT32 = 2**31 - 1
+NOTHING = {"count": 0, "ns": 0}
 
 
-class ServerMetadata(BaseModel):
-    name: str
-    version: str
-    extensions: list[str]
+def routes(handler: RequestHandler) -> list[Route]:
+    """Return the routes of /v2 besides inference."""
 
+    async def live(_call: Call) -> tuple[bytes, Headers]:
+        return _json({"live": True})
 
-class TensorMetadata(BaseModel):
-    name: str
-    datatype: str
-    shape: list[int] = Field(description="-1 is the batch.")
-
-
-class ModelMetadata(BaseModel):
-    name: str
-    versions: list[str]
-    platform: str
-    inputs: list[TensorMetadata]
-    outputs: list[TensorMetadata]
-
-
-class ModelState(BaseModel):
-    """A line of the repository index."""
-
-    name: str
-    version: str
-    state: str
-    reason: str
-
-
-def add_routes(app: FastAPI, handler: RequestHandler, add: Callable[[PostRoute], None]) -> None:
-    """Add /v2 to the application; `add` adds routes that FastAPI only documents."""
-    infer = HttpEndpoint("oip", OipHttpCodec(handler), handler)
-    _add_health(app, handler)
-    _add_models(app, handler)
-    body = {
-        "application/json": {"schema": _request_schema()},
-        "application/octet-stream": {"schema": {"type": "string", "format": "binary"}},
-    }
-    for route in post_routes("/v2/models", "infer", infer, tag=TAG, reply=InferReply, body=body):
-        add(route)
-
-
-def _request_schema() -> dict[str, Any]:
-    """The request's schema; the tensor's is already among the document's, through the reply."""
-    schema = InferRequest.model_json_schema(ref_template="#/components/schemas/{model}")
-    schema.pop("$defs")
-    return schema
-
-
-def _add_health(app: FastAPI, handler: RequestHandler) -> None:
-    get = partial(add_route, app, Access.open, "GET")
-
-    @get("/v2/health/live", "health", "The process answers (Open Inference Protocol)")
-    async def live() -> Response:
-        return json_response({"live": True})
-
-    @get("/v2/health/ready", "health", "The policies are loaded and proven", 503)
-    async def ready() -> Response:
+    async def ready(_call: Call) -> tuple[bytes, Headers]:
         handler.store()
-        return json_response({"ready": True})
+        return _json({"ready": True})
 
+    async def server(_call: Call) -> tuple[bytes, Headers]:
+        return _json(server_metadata())
 
-def _add_models(app: FastAPI, handler: RequestHandler) -> None:
-    get = partial(add_route, app, Access.act, "GET")
+    async def metadata(call: Call) -> tuple[bytes, Headers]:
+        return _json(model_metadata(handler, *_named(call)))
 
-    @get("/v2", TAG, "The server and the extensions it speaks", response_model=ServerMetadata)
-    async def server() -> Response:
-        return json_response(server_metadata())
+    async def model_ready(call: Call) -> tuple[bytes, Headers]:
+        return _json({"name": handler.store().get(*_named(call)).contract.name, "ready": True})
 
-    @get(MODEL, TAG, "A model", 404, 503, response_model=ModelMetadata)
-    async def model(name: str) -> Response:
-        return json_response(model_metadata(handler, name, None))
+    async def stats(call: Call) -> tuple[bytes, Headers]:
+        return _json({"model_stats": statistics(handler, call.params.get("name"), call.params.get("version"))})
 
-    @get(VERSION, TAG, "One version of a model", 404, 503, response_model=ModelMetadata)
-    async def model_version(name: str, version: str) -> Response:
-        return json_response(model_metadata(handler, name, version))
+    async def config(call: Call) -> tuple[bytes, Headers]:
+        return _json(model_config(handler, *_named(call)))
 
-    @get(f"{MODEL}/ready", TAG, "The model is loaded and proven", 404, 503)
-    async def model_ready(name: str) -> Response:
-        return json_response({"name": handler.store().get(name).contract.name, "ready": True})
-
-    @get(f"{VERSION}/ready", TAG, "The version is loaded", 404, 503)
-    async def model_version_ready(name: str, version: str) -> Response:
-        return json_response({"name": handler.store().get(name, version).contract.name, "ready": True})
-
-    @add_route(
-        app,
-        Access.act,
-        "POST",
-        "/v2/repository/index",
-        TAG,
-        "Every version of every model",
-        415,
-        503,
-        dependencies=[Depends(accept_media_type)],
-        response_model=list[ModelState],
-    )
-    async def index(request: Request) -> Response:
-        body = await request.body()
-        if len(body) > SMALL:
+    async def index(call: Call) -> tuple[bytes, Headers]:
+        check_media_type(call.headers, JSON, BINARY, optional=True)
+        if len(call.body) > SMALL:
             raise too_large(SMALL)
-        ready = False
-        if body:
-            document, _ = parse_json(body, such_as='{"ready": true}')
-            ready = bool(parse_flag(document, "ready"))
-        return json_response(repository_index(handler, ready=ready))
+        document, _ = parse_json(call.body or b"{}", such_as='{"ready": true}')
+        return _json(repository_index(handler, ready=bool(parse_flag(document, "ready"))))
+
+    models = "/v2/models"
+    return [
+        Route(GET, "/v2/health/live", Access.open, "The process answers", live),
+        Route(GET, "/v2/health/ready", Access.open, "The policies are loaded and proven", ready),
+        Route(GET, "/v2", Access.act, "The server and the extensions it speaks", server),
+        Route(GET, f"{models}/stats", Access.act, "Statistics of every model", stats),  # before a model of that name
+        *of_policy(GET, models, "", "Metadata of a model", answer=metadata),
+        *of_policy(GET, models, "/ready", "The model is loaded and proven", answer=model_ready),
+        *of_policy(GET, models, "/stats", "Statistics of a model", answer=stats),
+        *of_policy(GET, models, "/config", "Configuration of a model", answer=config),
+        Route(POST, "/v2/repository/index", Access.act, "Every version of every model", index),
+    ]
 
 
-# What can be asked, as the protocol's documents; gRPC's messages have the same fields.
+def _named(call: Call) -> tuple[str, str | None]:
+    return call.params["name"], call.params.get("version")
+
+
+def _json(document: Any) -> tuple[bytes, Headers]:
+    return orjson.dumps(document), JSON_HEADERS
 
 
 def server_metadata() -> dict[str, Any]:
@@ -191,5 +140,97 @@ def model_metadata(handler: RequestHandler, name: str, version: str | None) -> d
     }
 
 
-def json_response(document: Any) -> Response:
-    return Response(orjson.dumps(document), media_type="application/json")
+def model_config(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
+    """Return how a model is run, as ModelConfig; `version` None is the default.
+
+    Raises UnknownPolicyError, UnknownVersionError, UnavailableError.
+    """
+    policy = handler.store().get(name, version)
+    config: dict[str, Any] = {
+        "name": name,
+        "platform": PLATFORM,
+        "backend": BACKEND,
+        "max_batch_size": min(handler.settings.max_batch, LARGEST_INT32),
+        "input": [_input(tensor) for tensor in offered_inputs(policy)],
+        "output": [_tensor(tensor) for tensor in offered_outputs(policy.contract)],
+        "default_model_filename": ONNX_FILE,
+        "model_transaction_policy": {"decoupled": False},  # a request has one reply
+    }
+    if handler.store().batcher_of(policy) is not None:
+        # So many are run at once as soon as they are there, without waiting for others.
+        most = policy.options.micro_batch
+        config["dynamic_batching"] = {"preferred_batch_size": [most], "max_queue_delay_microseconds": 0}
+    elif policy.is_stateful:
+        config["sequence_batching"] = _sequences(handler, policy)
+    return config
+
+
+def _input(tensor: TensorSpec) -> dict[str, Any]:
+    described = _tensor(tensor)
+    if tensor.name == REWARD or tensor.name.startswith((STATE_IN, LAST_ACTION)):
+        described["optional"] = True  # an episode begins without
+    return described
+
+
+def _tensor(tensor: TensorSpec) -> dict[str, Any]:
+    """Return a tensor as Triton's configuration has it: without the axis of the batch."""
+    return {"name": tensor.name, "data_type": f"TYPE_{datatype_of(tensor.dtype)}", "dims": list(tensor.shape[1:])}
+
+
+def _sequences(handler: RequestHandler, policy: Policy) -> dict[str, Any]:
+    return {
+        "max_sequence_idle_microseconds": round(handler.settings.session_idle_s * 1e6),
+        "state": [
+            {
+                "input_name": STATE_IN + state.name,
+                "output_name": STATE_OUT + state.name,
+                "data_type": f"TYPE_{datatype_of(state.dtype)}",
+                "dims": list(state.shape),
+            }
+            for state in policy.contract.state
+        ],
+    }
+
+
+def statistics(handler: RequestHandler, name: str | None = None, version: str | None = None) -> list[dict[str, Any]]:
+    """Return what this replica has counted of each version since its start, as ModelStatistics.
+
+    Without a `version` of every version of the model, without a `name` of every model. All protocols count.
+    Raises UnknownPolicyError, UnknownVersionError, UnavailableError, and RequestError for a version of no model.
+    """
+    if name is None and version is not None:
+        raise RequestError(f"the version '{version[:32]}' is of no model: name one")
+    store = handler.store()
+    if name is None:
+        wanted = [(each, known) for each in store.names for known in store.versions(each)]
+    elif version is None:
+        wanted = [(name, known) for known in store.versions(name)]
+    else:
+        wanted = [(name, store.get(name, version).contract.version)]
+    return [_statistics(handler.metrics.totals(*which), *which) for which in wanted]
+
+
+def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
+    def duration(count: int, seconds: float) -> dict[str, int]:
+        return {"count": count, "ns": round(seconds * 1e9)}
+
+    return {
+        "name": name,
+        "version": version,
+        "last_inference": totals.last_answer_ms,
+        "inference_count": totals.observations,
+        "execution_count": totals.runs,
+        "inference_stats": {
+            "success": duration(totals.requests, totals.request_s),
+            "fail": duration(totals.failures, 0.0),  # how long they took is not kept
+            # What has been read is computed at once, and checking observation and action is in `compute_infer`: no time
+            # apart. The counts are equal all the same, perf_analyzer ends where they are not.
+            "queue": duration(totals.requests, 0.0),
+            "compute_input": duration(totals.requests, 0.0),
+            "compute_infer": duration(totals.requests, totals.inference_s),
+            "compute_output": duration(totals.requests, 0.0),
+            "cache_hit": NOTHING,
+            "cache_miss": NOTHING,
+        },
+        "batch_stats": [],
+    }

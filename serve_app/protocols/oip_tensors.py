@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError
-from rlservo.serve_app.protocols.json_messages import json_type
+from rlservo.serve_app.protocols.json_text import json_type
 from rlservo.serve_app.runtime.input_numbers import NUMBER_KINDS, describe, find_unfit, first_non_number, to_array
 
 DTYPES: dict[str, np.dtype[Any]] = {

@@ -3,21 +3,15 @@
 The page is static: anyone may open it, without a key. What it shows it asks of `/v1/policies` and
 `/metrics`, with the key that its user types if the server wants one, from where it stays in a variable.
 
-Sources: RFC 9110, section 12.5.1 (Accept); Content Security Policy Level 3; Trusted Types (W3C).
+Sources: Content Security Policy Level 3; Trusted Types (W3C).
 """
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-from fastapi import FastAPI, Request
-from starlette.datastructures import Headers
-from starlette.exceptions import HTTPException
-from starlette.responses import Response
-from starlette.routing import Match, Route
-from starlette.types import Scope
-
+from rlservo.serve_app.protocols.http_errors import Headers
+from rlservo.serve_app.protocols.routes import GET, Answer, Call, Route
 from rlservo.serve_app.server.api_keys import Access
 
 FOLDER = Path(__file__).with_name("page")
@@ -49,61 +43,24 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-QUALITY = re.compile(r"0(\.[0-9]{0,3})?|1(\.0{0,3})?")
 
 
-def add_status_page(app: FastAPI) -> None:
-    """Serve the page at `/` to who prefers HTML, and its files under /page."""
+def routes() -> list[Route]:
+    """Return the page at `/`, and its files under /page."""
     files = {path.name: path.read_bytes() for path in FOLDER.iterdir() if path.suffix in MEDIA_TYPES}
-    page = files.pop(INDEX)
 
-    async def index(_request: Request) -> Response:
-        return _reply(INDEX, page, {"Vary": "Accept"})
+    def reply(name: str, *headers: tuple[bytes, bytes]) -> Answer:
+        own = {**HEADERS, "content-type": MEDIA_TYPES[Path(name).suffix]}
+        every = (*((key.lower().encode(), value.encode()) for key, value in own.items()), *headers)
 
-    async def file(request: Request) -> Response:
-        name = request.path_params["file"]
-        if name not in files:
-            raise HTTPException(404)
-        return _reply(name, files[name], {})
+        async def answer(_call: Call) -> tuple[bytes, Headers]:
+            return files[name], every
 
-    app.router.routes += [_PageRoute("/", index), _FileRoute("/page/{file}", file)]
+        return answer
 
-
-class _FileRoute(Route):
-    """The page's script, style and icon, the same for every client."""
-
-    access = Access.open
-
-
-class _PageRoute(Route):
-    """The page; for who does not prefer HTML, and for other methods, there is no such route."""
-
-    access = Access.open
-
-    def matches(self, scope: Scope) -> tuple[Match, Scope]:
-        match, child = super().matches(scope)
-        if match is Match.FULL and prefers_html(",".join(Headers(scope=scope).getlist("accept"))):
-            return match, child
-        return Match.NONE, {}
-
-
-def prefers_html(accept: str) -> bool:
-    """Return whether an `Accept` header asks for HTML rather than for JSON; `*/*` and none at all do not."""
-    html, json = (_quality(accept, *kind) for kind in (("text", "html"), ("application", "json")))
-    return html > json
-
-
-def _quality(accept: str, kind: str, subtype: str) -> float:
-    """Return how much a media type is wanted, from 0 to 1: as the range says that names it most closely."""
-    ranges = (f"{kind}/{subtype}", f"{kind}/*", "*/*")
-    found: dict[str, float] = {}
-    for part in accept.lower().split(","):
-        media_range, *parameters = (item.strip() for item in part.split(";"))
-        quality = next((item[2:] for item in parameters if item.startswith("q=")), "1")
-        if media_range in ranges and QUALITY.fullmatch(quality):
-            found[media_range] = max(float(quality), found.get(media_range, 0.0))
-    return next((found[each] for each in ranges if each in found), 0.0)
-
-
-def _reply(name: str, content: bytes, headers: dict[str, str]) -> Response:
-    return Response(content, headers={**HEADERS, **headers}, media_type=MEDIA_TYPES[Path(name).suffix])
+    page = Route(GET, "/", Access.open, "Status page", reply(INDEX, (b"vary", b"Accept")), is_page=True)
+    others = sorted(files.keys() - {INDEX})
+    return [
+        page,
+        *(Route(GET, f"/page/{name}", Access.open, "File of the status page", reply(name)) for name in others),
+    ]

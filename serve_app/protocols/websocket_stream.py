@@ -18,9 +18,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Callable, Mapping
-
-from starlette.types import Message, Receive, Scope, Send
+from collections.abc import Mapping
 
 from rlservo.export.contract.errors import (
     ForbiddenError,
@@ -31,10 +29,10 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.episodes.request import Request, new_episode_id
 from rlservo.serve_app.episodes.session import Session
-from rlservo.serve_app.protocols.action_routes import StreamRoute
 from rlservo.serve_app.protocols.http_errors import encode_bug, error_answer, fail_stream, refuse_upgrade
-from rlservo.serve_app.protocols.json_messages import encode_json
+from rlservo.serve_app.protocols.json_text import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
+from rlservo.serve_app.protocols.routes import WEBSOCKET, Route
 from rlservo.serve_app.server.access_checks import (
     HEADERS,
     LABEL,
@@ -44,8 +42,10 @@ from rlservo.serve_app.server.access_checks import (
     header_text,
     presented_key,
 )
+from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.metrics import IDLE
 from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.wire.asgi import Message, Receive, Scope, Send
 
 logger = logging.getLogger(__name__)
 
@@ -57,11 +57,10 @@ SILENT = "silent for too long"
 REVOKED = (UnauthenticatedError, ForbiddenError)  # what the key of a stream may come to
 
 
-def add_routes(handler: RequestHandler, add: Callable[[StreamRoute], None]) -> None:
-    """Add the streams to the application."""
+def routes(handler: RequestHandler) -> list[Route]:
+    """Return the routes of streams."""
     stream = StreamEndpoint(handler)
-    for path in STREAM_PATHS:
-        add(StreamRoute(path, stream))
+    return [Route(WEBSOCKET, path, Access.act, "Stream of actions", app=stream) for path in STREAM_PATHS]
 
 
 class StreamEndpoint:

@@ -25,9 +25,8 @@ from rlservo.serve_app.wire.loopback import is_loopback
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 if TYPE_CHECKING:
-    from starlette.types import Scope
-
     from rlservo.serve_app.server.api_key_file import CurrentKeys
+    from rlservo.serve_app.wire.asgi import Scope
 
 # Every path of ours can be written in it. What needs escaping, or is read differently by different programs, is not
 # routed at all: control characters, encoded and doubled slashes, dot segments, ';', '\'.

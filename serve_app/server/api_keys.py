@@ -16,11 +16,9 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar
 
 from typing_extensions import Self
 
@@ -38,9 +36,6 @@ A_KEY = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{16,}")
 KEY_BYTES = 32
 LONGEST_FILE = 1 << 20  # [bytes] of the key file: some ten thousand keys
 SCHEMES = (b"bearer", b"api-key")  # the second is what openpi's clients say
-ACCESS = "access"  # the attribute of a route, or of its endpoint, that says who may use it
-
-Endpoint = TypeVar("Endpoint")
 
 
 class Role(str, Enum):
@@ -53,7 +48,7 @@ class Role(str, Enum):
 
 
 class Access(Enum):
-    """Access to a route or a method; `grant` and the route classes write it down where a route is made."""
+    """Access to a route or a method."""
 
     open = "open"
     """Every client, without a key: probes of orchestrators, and web pages that hold no data of policies."""
@@ -63,25 +58,6 @@ class Access(Enum):
 
     admin = "admin"
     """Clients with an admin key or the operator's; if the server has none, no one."""
-
-
-def grant(access: Access) -> Callable[[Endpoint], Endpoint]:
-    """Write down who may use a route, on its endpoint."""
-
-    def mark(endpoint: Endpoint) -> Endpoint:
-        setattr(endpoint, ACCESS, access)
-        return endpoint
-
-    return mark
-
-
-def access_of(route: Any) -> Access:
-    """Return who may use a route; by default administrators alone."""
-    for part in (route, getattr(route, "endpoint", None)):
-        found = getattr(part, ACCESS, None)
-        if isinstance(found, Access):
-            return found
-    return Access.admin
 
 
 @dataclass(frozen=True)

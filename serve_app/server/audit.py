@@ -11,7 +11,6 @@ from typing import Any
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.request_log import FIELDS, LONGEST_ID, administration
 
-AUDIT = "rlservo.audit"  # in a connection's scope: its entry
 OK = "ok"
 UNANSWERED = "unanswered"  # its client went, or the replica ended: a change may or may not have been made
 LONGEST = 256  # characters of what a client chose

@@ -1,67 +1,20 @@
-"""Listing of policies and versions: what runs here, since when, and what failed to load.
-
-The models describe the wire. The documents are this replica's own; `/v1/admin/policies` gathers all of them.
-"""
+"""Listing of policies and versions: what this process serves, since when, and what failed to load."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, Field
-
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.plan_follower import VersionState
-from rlservo.serve_app.versions.serving_plan import Canary
-
-
-class VersionStatus(BaseModel):
-    """One version of a policy, on the replica that answers."""
-
-    version: str
-    state: str = Field(description="`loading`, `ready` or `failed`.")
-    reason: str = Field(description="Why it failed; empty otherwise.")
-    aliases: list[str]
-    loaded_at: str | None = Field(description="UTC; when this replica had loaded and proven it.")
-    requests: int = Field(description="Answered by this replica, over all protocols.")
-
-
-class ShadowStatus(BaseModel):
-    """A version that computes along, and how it compares so far, on the replica that answers."""
-
-    version: str
-    compared: int
-    mean_difference: float | None
-    largest_difference: float | None
-    failed: int
-    left_out: int
-
-
-class PolicySummary(BaseModel):
-    """A policy of `GET /v1/policies`."""
-
-    name: str
-    version: str = Field(description="The default: where the alias `production` leads.")
-    versions: list[str] = Field(description="Those that answer, oldest first.")
-    description: str
-    control_rate_hz: float | None
-    aliases: dict[str, str]
-    previous: dict[str, str] = Field(description="Where a rollback of an alias would lead.")
-    canary: Canary | None
-    shadow: ShadowStatus | None
-    version_states: list[VersionStatus]
-
-
-class PolicyList(BaseModel):
-    policies: list[PolicySummary]
-    replica: str = Field(description="Which replica answers; counts and states are its own.")
-    generation: int = Field(description="Counts the changes of what is served; the same number, the same policies.")
-    changed_at: str | None
-    changed_by: str | None
-    behind: list[str] = Field(description="What this process could not follow, a sentence each; usually empty.")
 
 
 def describe(handler: RequestHandler) -> dict[str, Any]:
-    """Return what `GET /v1/policies` answers, as `PolicyList`."""
+    """Return what `GET /v1/policies` answers; states, counts and comparisons are this process's own.
+
+    `version` is where the alias `production` leads, `versions` are those that answer, the oldest first, `previous` is
+    where a rollback of each alias would lead. A version is `loading`, `ready` or `failed`. `generation` is the plan's
+    number; `behind` says what of it this process could not follow.
+    """
     store, control = handler.store(), handler.control
     plan = control.plan if control is not None else None
     states = states_of(handler)

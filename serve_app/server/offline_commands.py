@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlservo.export.contract.contract import version_key
+from rlservo.export.contract.errors import RequestError, UsageError
 from rlservo.serve_app.repository.repository import raise_all
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import plan_files, version_loader
@@ -26,7 +27,10 @@ class OfflineCommands:
 
     def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
         """Carry out a command on a policy; return what is served of it then, as the server would."""
-        given = parse(command, document)
+        try:
+            given = parse(command, document)
+        except RequestError as error:
+            raise UsageError(error.message) from None
         what = f"{command} {name} {given.words()}".strip()
         plan = asyncio.run(given.give(PlanWriter(self._loader, self._files), name, what))
         return {**Changed.of(plan, name).model_dump(), "place": self._files.place}

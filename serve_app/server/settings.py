@@ -64,9 +64,6 @@ class ServerSettings(BaseModel):
     """Addresses, separated by commas, of proxies in front of the embedded server whose `X-Forwarded-For` names the
     client, for the log and the bound above; none by default."""
 
-    grpc_reflection: bool = False
-    """Answer gRPC's reflection service, by which grpcurl and others find methods and messages (embedded server)."""
-
     stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A stream (WebSocket, gRPC) that was silent for this long is closed."""
 
@@ -167,9 +164,6 @@ class ServerSettings(BaseModel):
     """[s] Look through the places of policies this often, and load versions that are newer than those known, as
     `rlservo policy load` does: ready, not in use. Off by default. Also set by `rlservo serve --poll`. The plan is read
     twice a second, in object storage every 5 s, or at this interval if it is shorter."""
-
-    docs: bool = True
-    """Serve web pages from the server's own files: the status page at `/`, the API's documentation at /docs."""
 
     @property
     def bundle_limits(self) -> BundleLimits:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from rlservo.export.contract.errors import RequestError, UsageError
+from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan_writer import Change
 from rlservo.serve_app.versions.serving_plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
@@ -80,7 +80,7 @@ class SetAlias(Command):
 
 class Rollback(Command):
     summary = "Let an alias lead where it led before"
-    alias: Alias = PRODUCTION
+    alias: Alias = Field(PRODUCTION, description="The alias; `production` when left out.")
     expected: Version | None = Field(
         None, description="Where the alias leads now; when it does not, nothing changes. Makes a repeated command safe."
     )
@@ -156,10 +156,10 @@ class Changed(BaseModel):
 
 
 def parse(command: str, document: dict[str, Any]) -> Command:
-    """Return a command that was given on the command line. Raises UsageError."""
+    """Return a command from its fields. Raises RequestError."""
     try:
         return COMMANDS[command].model_validate(document)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
-        raise UsageError(f"{command}: {where}: {first['msg']} (given: {first['input']!r:.80})") from None
+        raise RequestError(f"{command}: {where}: {first['msg']} (given: {first['input']!r:.80})") from None

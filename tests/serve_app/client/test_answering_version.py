@@ -73,7 +73,7 @@ def serve(served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Call
             server.move("1")
             app = create_app(lambda: server.store, ServerSettings())
             server.url = f"http://127.0.0.1:{stack.enter_context(served(app))}"
-            server.handler = app.state.handler
+            server.handler = app.handler
             return server
 
         yield start

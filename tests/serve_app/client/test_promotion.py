@@ -74,7 +74,7 @@ class Server:
 
     @property
     def handler(self) -> RequestHandler:
-        handler: RequestHandler = self.app.state.handler
+        handler: RequestHandler = self.app.handler
         return handler
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:

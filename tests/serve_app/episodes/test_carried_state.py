@@ -189,7 +189,7 @@ class Call:
 
 
 def test_so_does_grpc(server: Server, versions: dict[str, Policy]) -> None:
-    grpc = Grpc(server.app.state.handler)
+    grpc = Grpc(server.app.handler)
 
     def infer(state: bytes | None, **parameters: Any) -> tuple[Any, Call]:
         request = messages.ModelInferRequest(model_name="leaky")

@@ -33,7 +33,7 @@ MOST = 8
 class Server:
     def __init__(self, port: int, app: Any, client: httpx.Client) -> None:
         self.port = port
-        self.sessions: MemorySessions = app.state.handler.episodes.sessions
+        self.sessions: MemorySessions = app.handler.episodes.sessions
         self._client = client
 
     def act(self, session_id: str, *, rows: int | None = None, policy: str = "leaky", **more: Any) -> tuple[int, Any]:

@@ -15,7 +15,6 @@ import msgpack
 import numpy as np
 import pytest
 import websockets.sync.client
-from fastapi import FastAPI
 from onnx import TensorProto, helper
 
 from bundles import PARITY, PROVENANCE, save_graph, write_bundle
@@ -25,6 +24,7 @@ from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import FIELDS, OipGrpcCodec
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.input_numbers import parse_array
@@ -107,7 +107,7 @@ def write_counter(root: Path, dtype: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
+def app(tmp_path_factory: pytest.TempPathFactory) -> PolicyApp:
     root = tmp_path_factory.mktemp("integers")
     for dtype in TYPES:
         write_counter(root, dtype)
@@ -116,7 +116,7 @@ def app(tmp_path_factory: pytest.TempPathFactory) -> FastAPI:
 
 
 @pytest.fixture(scope="module")
-def http(app: FastAPI, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[httpx.Client]:
+def http(app: PolicyApp, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[httpx.Client]:
     with served(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
         yield client
 
@@ -175,7 +175,7 @@ def test_json_observations_are_held_to_the_same(http: httpx.Client, number: str)
         ("uint8", np.array([0.5, 1], np.float16)),
     ],
 )
-def test_so_are_bytes(http: httpx.Client, app: FastAPI, policy: str, array: Any) -> None:
+def test_so_are_bytes(http: httpx.Client, app: PolicyApp, policy: str, array: Any) -> None:
     datatype = {"float64": "FP64", "float32": "FP32", "float16": "FP16"}.get(array.dtype.name, array.dtype.name.upper())
     head = json.dumps(
         {"inputs": [{"name": "obs", "shape": [1, 2], "datatype": datatype,
@@ -200,8 +200,8 @@ def test_so_are_bytes(http: httpx.Client, app: FastAPI, policy: str, array: Any)
         assert "integer" in json.loads(stream.recv())["error"]
 
 
-def over_grpc(app: FastAPI, policy: str, datatype: str, array: Any, *, raw: bool) -> Any:
-    handler = app.state.handler
+def over_grpc(app: PolicyApp, policy: str, datatype: str, array: Any, *, raw: bool) -> Any:
+    handler = app.handler
     asked = messages.ModelInferRequest(model_name=policy)
     given = asked.inputs.add(name="obs", datatype=datatype, shape=[1, 2])
     if raw:
@@ -212,13 +212,13 @@ def over_grpc(app: FastAPI, policy: str, datatype: str, array: Any, *, raw: bool
     return asyncio.run(handler.answer(OipGrpcCodec(handler), request, (asked.SerializeToString(), None)))
 
 
-def test_typed_contents_of_64_bits_are_kept_exactly(app: FastAPI) -> None:
+def test_typed_contents_of_64_bits_are_kept_exactly(app: PolicyApp) -> None:
     for policy, values in (("uint64", [2**63 + 1, 1]), ("int64", [2**53 + 1, 1])):
         reply = over_grpc(app, policy, policy.upper(), np.array(values, policy), raw=False)
         assert list(reply.outputs[0].contents.fp32_contents) == [values[0] % 1000, 1.0]
 
 
-def test_a_bool_is_a_byte_of_0_or_1(http: httpx.Client, app: FastAPI) -> None:
+def test_a_bool_is_a_byte_of_0_or_1(http: httpx.Client, app: PolicyApp) -> None:
     array = np.array([2, 1], np.uint8)
     head = json.dumps(
         {"inputs": [{"name": "obs", "shape": [1, 2], "datatype": "BOOL", "parameters": {"binary_data_size": 2}}]}
@@ -231,8 +231,8 @@ def test_a_bool_is_a_byte_of_0_or_1(http: httpx.Client, app: FastAPI) -> None:
 
 
 @pytest.mark.parametrize("given", [[1.7, 1], [2**63, 1], [np.float32(2**24), 1], np.array([300, 1]), ["1", "1"]])
-def test_in_process_too(app: FastAPI, given: Any) -> None:
-    policy: Policy = app.state.handler.store().get("uint8")
+def test_in_process_too(app: PolicyApp, given: Any) -> None:
+    policy: Policy = app.handler.store().get("uint8")
     with pytest.raises(ObservationError, match=r"integer|number"):
         policy.act(given)
 

@@ -7,7 +7,6 @@ import gzip
 import http.client
 import json
 import random
-import re
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -18,7 +17,6 @@ import pytest
 
 from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.docs_page import PAGE
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from servers import over_uvicorn
@@ -250,68 +248,6 @@ def test_an_unexpected_failure_says_no_more_than_that(
     finally:
         loading.store = store
     assert "AttributeError" in caplog.text
-
-
-def test_the_documentation_is_whole_without_a_network(ask: Ask) -> None:
-    assert ask("GET", "/docs")[2].decode() == PAGE
-    assert "http" not in PAGE.replace("html", "")
-    for reference in re.findall(r'(?:href|src)="([^"]+)"', PAGE):
-        status, _, content = ask("GET", f"/{reference}")
-        assert status == 200 and len(content) > 500
-    assert ask("GET", "/redoc")[0] == 404
-
-
-def test_the_openapi_document_is_valid_3_0_and_describes_every_route(ask: Ask) -> None:
-    document = ask("GET", "/openapi.json")[2]
-    assert document["openapi"] == "3.0.3"
-    assert set(document["paths"]) == {
-        "/v1/policies",
-        "/v1/policies/{name}",
-        "/v1/policies/{name}/versions/{version}",
-        "/v1/policies/{name}/act",
-        "/v1/policies/{name}/versions/{version}/act",
-        "/healthz",
-        "/metrics",
-        "/v2",
-        "/v2/health/live",
-        "/v2/health/ready",
-        "/v2/models/{name}",
-        "/v2/models/{name}/versions/{version}",
-        "/v2/models/{name}/ready",
-        "/v2/models/{name}/versions/{version}/ready",
-        "/v2/models/{name}/infer",
-        "/v2/models/{name}/versions/{version}/infer",
-        "/v2/models/stats",
-        "/v2/models/{name}/stats",
-        "/v2/models/{name}/config",
-        "/v2/models/{name}/versions/{version}/stats",
-        "/v2/models/{name}/versions/{version}/config",
-        "/v2/repository/index",
-    }
-    request = document["paths"]["/v1/policies/{name}/act"]["post"]["requestBody"]["content"]["application/json"][
-        "schema"
-    ]
-    of_episode = {"state", "session_id", "reset", "end", "reward", "last_action", "final_status", "truncated"}
-    assert set(request["properties"]) == {"obs", "explore", "seed", "seq", "deadline_ms", "timestamp", *of_episode}
-
-    def walk(node: Any) -> None:
-        if isinstance(node, list):
-            for item in node:
-                walk(item)
-        elif isinstance(node, dict):
-            assert node.get("type") != "null" and not {"const", "prefixItems", "$defs"} & set(node), node
-            if "$ref" in node:
-                target: Any = document
-                for part in node["$ref"].removeprefix("#/").split("/"):
-                    target = target[part]
-            for key, value in node.items():
-                if key not in ("example", "default", "properties"):
-                    walk(value)
-                elif key == "properties":
-                    for schema in value.values():
-                        walk(schema)
-
-    walk(document)
 
 
 def malformed_bodies() -> Iterator[bytes]:

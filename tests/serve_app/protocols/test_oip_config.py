@@ -14,9 +14,9 @@ import pytest
 
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.oip_config import model_config, statistics
 from rlservo.serve_app.protocols.oip_grpc import _numbered
 from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.oip_models import model_config, statistics
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
@@ -106,7 +106,7 @@ def test_every_input_and_output_of_the_metadata_is_in_the_configuration(ask: Ask
 def test_an_alias_means_its_version(store: PolicyStore) -> None:
     plan = PolicyPlan(versions={"1": "", "2": "", "10": ""}, aliases={"production": "2"})
     aliased = PolicyStore([store.get("ur5", version) for version in ("1", "2", "10")], {"ur5": plan})
-    handler = create_app(lambda: aliased, ServerSettings()).state.handler
+    handler = create_app(lambda: aliased, ServerSettings()).handler
     assert [each["version"] for each in statistics(handler, "ur5", "production")] == ["2"]
     assert [each["version"] for each in statistics(handler, "ur5")] == ["1", "2", "10"]
 
@@ -153,7 +153,7 @@ def test_statistics_count_what_was_answered_over_every_protocol(ask: Ask) -> Non
 
 
 def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) -> None:
-    handler = create_app(lambda: store, ServerSettings()).state.handler
+    handler = create_app(lambda: store, ServerSettings()).handler
     batcher = store.batcher_of(store.get("gathered"))
     assert batcher is not None
 
@@ -185,7 +185,7 @@ def test_extensions_name_both(ask: Ask) -> None:
 
 def test_messages_take_every_field_of_the_documents(store: PolicyStore) -> None:
     """A field that a message lacks is a ValueError: the two forms cannot drift apart."""
-    handler = create_app(lambda: store, ServerSettings()).state.handler
+    handler = create_app(lambda: store, ServerSettings()).handler
     for name in store.names:
         config = messages.ModelConfigResponse(config=_numbered(model_config(handler, name, None))).config
         assert config.input[0].data_type in (9, 11) and config.name == name  # Triton's TYPE_INT64 and TYPE_FP32

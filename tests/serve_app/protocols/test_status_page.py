@@ -22,7 +22,7 @@ from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.spaces import BoxSpec, Element
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.status_page import FOLDER, prefers_html
+from rlservo.serve_app.protocols.status_page import FOLDER
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_changes import set_alias
@@ -37,7 +37,6 @@ Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
 CHROMIUM = "text/html,application/xhtml+xml,application/xml;q=0.9,image/avif,image/webp,*/*;q=0.8"
-FIREFOX = "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"
 PAGE = {"accept": CHROMIUM}
 OPERATOR, OPERATOR_LINE = new_key("operator", admin=True)
 ROBOT, ROBOT_LINE = new_key("cell-7")
@@ -49,42 +48,12 @@ ROUND_MS = 250  # between two of the page's looks, instead of two seconds
 PICTURES = os.environ.get("RLSERVO_TEST_PICTURES")
 
 
-@pytest.mark.parametrize(
-    "accept", [CHROMIUM, FIREFOX, "text/html", "TEXT/HTML", "text/*", "application/json;q=0.9,text/html"]
-)
-def test_who_prefers_html_gets_the_page(accept: str) -> None:
-    assert prefers_html(accept)
-
-
-@pytest.mark.parametrize(
-    "accept",
-    [
-        "",
-        "*/*",
-        "application/json",
-        "application/json, text/html",  # as much of the one as of the other: what programs have always got
-        "application/json, text/html;q=0.9, */*;q=0.1",
-        "text/html;q=0",
-        "text/html;q=0, */*",
-        "text/html;q=2",  # not a quality
-        "text/html;q=nan",
-        "text/html;q=-1",
-        "text/html;q=",
-        "text/htmlx",
-        "application/*, text/html;q=0.5",
-        "*/*;q=1, text/html;q=0.5",
-        ",,;;,",
-    ],
-)
-def test_everybody_else_gets_json(accept: str) -> None:
-    assert not prefers_html(accept)
-
-
 def test_programs_get_at_the_root_what_they_always_got(policies: Path, served: Serve) -> None:
     store = load_store(policies)
     for settings, statuses in ((ServerSettings(), (404, 404)), (ServerSettings(api_keys=ROBOT_LINE), (401, 404))):
         with served(create_app(lambda: store, settings)) as port:
-            for headers in ({}, {"accept": "*/*"}, {"accept": "application/json"}):
+            for accept in ("", "*/*", "application/json", "application/json, text/html;q=0.9"):
+                headers = {"accept": accept}
                 for key, status in zip(({}, {"authorization": f"Bearer {ROBOT}"}), statuses, strict=True):
                     reply = httpx.get(f"http://127.0.0.1:{port}/", headers={**headers, **key})
                     assert (reply.status_code, reply.headers["content-type"]) == (status, "application/json")
@@ -124,13 +93,6 @@ def test_the_page_is_open_its_data_are_not_and_nothing_may_be_added_to_it(polici
             assert httpx.get(f"{url}/{path}", headers=PAGE).status_code == 401, path
         rebound = httpx.get(f"{url}/", headers={**PAGE, "host": "evil.example"})
         assert (rebound.status_code, rebound.json()["code"]) == (403, "forbidden")
-
-
-def test_without_web_pages_there_is_none(policies: Path, served: Serve) -> None:
-    store = load_store(policies)
-    with served(create_app(lambda: store, ServerSettings(docs=False))) as port:
-        for path in ("", "page/status.js", "docs"):
-            assert httpx.get(f"http://127.0.0.1:{port}/{path}", headers=PAGE).status_code == 404
 
 
 def test_the_page_names_no_other_host_and_keeps_nothing() -> None:
@@ -491,7 +453,7 @@ window.finished = Promise.all([
   note("page", fetch(target + "/", {headers: {accept: "text/html"}}).then(reply => reply.text())),
   note("opaque", fetch(target + "/", {headers: {accept: "text/html"}, mode: "no-cors"}).then(reply => reply.type)),
   note("script", load("script", "/page/status.js")), note("icon", load("img", "/page/icon.svg")),
-  note("frame", frame("/")), note("docs", frame("/docs")),
+  note("frame", frame("/")),
 ]).then(() => out);
 </script>"""
 
@@ -511,9 +473,9 @@ def test_a_foreign_page_gets_nothing_of_it(tab: Tab, server: Served, served: Ser
         tab.wait_for("window.finished")
         found = tab.evaluate("window.finished")
         assert [found.pop(name) for name in ("page", "opaque", "script", "icon")] == ["TypeError"] * 2 + ["refused"] * 2
-        assert found == {"frame": "null", "docs": "null"}
+        assert found == {"frame": "null"}
         frames = tab.call("Page.getFrameTree")["frameTree"]["childFrames"]
-        assert [frame["frame"]["url"] for frame in frames] == ["chrome-error://chromewebdata/"] * 2, frames
+        assert [frame["frame"]["url"] for frame in frames] == ["chrome-error://chromewebdata/"], frames
 
 
 @pytest.mark.serve

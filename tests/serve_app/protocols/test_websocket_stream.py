@@ -307,7 +307,7 @@ def test_a_client_that_goes_while_it_is_answered_is_no_failure_of_the_server(
     asyncio.run(app(scope, receive, send))
     assert sent == ["websocket.accept", "websocket.send", "websocket.send"]
     assert not [record for record in caplog.records if record.levelname == "ERROR"]
-    assert b'code="internal"' not in asyncio.run(exposition(app.state.handler))
+    assert b'code="internal"' not in asyncio.run(exposition(app.handler))
 
 
 def test_many_robots_stream_at_once_and_none_gets_anothers_action(port: int, store: PolicyStore) -> None:

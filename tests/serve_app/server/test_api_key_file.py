@@ -219,11 +219,11 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
             assert hanging.wait(10)
             assert status(port, OLD) == 200
             time.sleep(0.2)
-            assert b'rlservo_api_keys_current{replica=""} 0.0' in asyncio.run(exposition(app.state.handler))
+            assert b'rlservo_api_keys_current{replica=""} 0.0' in asyncio.run(exposition(app.handler))
     finally:
         go_on.set()
     monkeypatch.setattr(api_key_file, "STALE_S", 10.0)
-    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in asyncio.run(exposition(app.state.handler)))
+    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in asyncio.run(exposition(app.handler)))
 
 
 def test_the_watching_ends_with_the_application(file: Path) -> None:

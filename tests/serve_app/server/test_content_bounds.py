@@ -16,7 +16,6 @@ import numpy as np
 import orjson
 import pytest
 import websockets.sync.client
-from fastapi import FastAPI
 
 from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.contract import Contract
@@ -24,6 +23,7 @@ from rlservo.export.contract.errors import TooLargeError
 from rlservo.export.contract.spaces import BoxSpec, DictSpec, DiscreteSpec, Element, TupleSpec
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.server.content_bounds import ContentBounds
@@ -72,13 +72,13 @@ FRAMES = {
 
 
 @pytest.fixture(scope="module")
-def app(ur5: Path) -> FastAPI:
+def app(ur5: Path) -> PolicyApp:
     store = load_store(ur5)
     return create_app(lambda: store, ServerSettings(max_batch=ROWS, default_policy="ur5"))
 
 
 @pytest.fixture(scope="module")
-def http(app: FastAPI, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[httpx.Client]:
+def http(app: PolicyApp, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[httpx.Client]:
     with served(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
         yield client
 
@@ -99,7 +99,7 @@ def test_a_frame_of_more_than_a_batch_needs_is_not_unpacked(http: httpx.Client, 
         assert json.loads(stream.recv())["code"] == "too-large"
 
 
-def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: FastAPI) -> None:
+def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: PolicyApp) -> None:
     many = messages.ModelInferRequest(model_name="ur5")
     for number in range(20_000):
         many.inputs.add(name=f"i{number}")
@@ -109,7 +109,7 @@ def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: FastAPI) -> N
     long = messages.ModelInferRequest(model_name="ur5", id="x" * 1_000_000)
     for message in (many, named, long):
         request = Request("grpc", "", None, time.perf_counter())
-        handler = app.state.handler
+        handler = app.handler
         with pytest.raises(TooLargeError):
             asyncio.run(handler.answer(OipGrpcCodec(handler), request, (message.SerializeToString(), None)))
 

@@ -133,7 +133,7 @@ def test_a_websockets_frames_count_and_one_too_many_ends_it_or_not(port: int, ap
         connect()
     assert caught.value.response.status_code == 429
     assert 900 < int(caught.value.response.headers["retry-after"]) <= 1000
-    app.state.handler.keys.limits._buckets.clear()
+    app.handler.keys.limits._buckets.clear()
     with connect() as stream:
         stream.recv()
         for _ in range(BURST - 1):
@@ -190,7 +190,7 @@ def infer(*, explore: bool = False) -> bytes:
 
 def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
     async def calls() -> list[Context]:
-        service, contexts = Grpc(app.state.handler), []
+        service, contexts = Grpc(app.handler), []
         for _ in range(BURST + 1):
             contexts.append(Context(LIMITED))
             await service.answer("ModelInfer", (infer(), None), contexts[-1])
@@ -208,7 +208,7 @@ def test_a_grpc_streams_messages_count_and_it_goes_on(app: PolicyApp) -> None:
             yield infer()
 
     async def replies() -> list[str]:
-        stream = Grpc(app.state.handler).stream(requests(), context)
+        stream = Grpc(app.handler).stream(requests(), context)
         return [reply.error_message async for reply in stream]
 
     context = Context(LIMITED)
@@ -224,7 +224,7 @@ def test_grpc_refuses_exploring_to_a_key_for_actions_alone(app: PolicyApp) -> No
         yield infer()
 
     async def calls() -> tuple[Context, list[str]]:
-        service, context = Grpc(app.state.handler), Context(FREE)
+        service, context = Grpc(app.handler), Context(FREE)
         await service.answer("ModelInfer", (infer(explore=True), None), context)
         return context, [reply.error_message async for reply in service.stream(requests(), Context(FREE))]
 

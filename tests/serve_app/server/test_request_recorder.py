@@ -75,9 +75,7 @@ def start(recurrent: Path, ur5: Path, served: Serve, tmp_path: Path) -> Iterator
         def serve(options: dict[str, PolicyOptions] | None = None, **settings: Any) -> Server:
             store = load_store(recurrent, ur5, options=options)
             app = create_app(lambda: store, ServerSettings(record=str(tmp_path / "recorded"), **settings))
-            server = Server(
-                stack.enter_context(served(app)), tmp_path / "recorded", app.state.handler.recorder, app.state.handler
-            )
+            server = Server(stack.enter_context(served(app)), tmp_path / "recorded", app.handler.recorder, app.handler)
             stack.callback(server.recorder.close)
             return server
 

@@ -223,7 +223,7 @@ def test_oip_streams_and_grpc_are_computed_together_too(port: int, store: Policy
             return [unpack(await one.recv())["actions"] for one in opened]
 
     async def calls() -> list[Any]:
-        handler = create_app(lambda: store, ServerSettings()).state.handler
+        handler = create_app(lambda: store, ServerSettings()).handler
         codec, answer = OipGrpcCodec(handler), handler.answer
         asked = messages.ModelInferRequest(model_name="ur5")
         asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
@@ -287,7 +287,7 @@ def test_a_warning_is_in_the_reply_to_what_it_is_about(bounded: Path) -> None:
 
 
 def test_a_deadline_that_passes_while_others_are_read_is_told_and_not_computed(store: PolicyStore) -> None:
-    handler = create_app(lambda: store, ServerSettings()).state.handler
+    handler = create_app(lambda: store, ServerSettings()).handler
 
     async def slow() -> None:
         time.sleep(0.05)  # another request of the same turn

@@ -1,0 +1,107 @@
+"""Routing table of the application: method, path and access of every route."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from rlservo.serve_app.protocols.http_errors import Headers
+from rlservo.serve_app.server.access_checks import PATH
+from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.audit import AuditEntry
+from rlservo.serve_app.wire.asgi import ASGIApp
+
+GET, POST, WEBSOCKET = "GET", "POST", "WEBSOCKET"
+PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
+PARAMETER = re.compile(r"\\{(\w+)\\}")  # in an escaped path
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A request whose body has been read."""
+
+    params: Mapping[str, str]  # of the path
+    headers: Mapping[bytes, bytes]
+    body: bytes
+    audit: AuditEntry
+
+
+Answer: TypeAlias = Callable[[Call], Awaitable[tuple[bytes, Headers]]]
+"""Returns the body and headers of a reply. Raises RlservoError."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """A method and a path such as `/v1/policies/{name}`, and what answers there."""
+
+    method: str
+    path: str
+    access: Access
+    summary: str
+    answer: Answer | None = None
+    app: ASGIApp | None = None
+    """In place of `answer`: of actions and streams, a callable that reads what it wants itself."""
+    is_page: bool = False
+    """For browsers, which ask for HTML and not for JSON; for others there is no such route."""
+
+
+def of_policy(
+    method: str, prefix: str, suffix: str, summary: str, *, answer: Answer | None = None, app: ASGIApp | None = None
+) -> list[Route]:
+    """Return the routes of a policy's default version, and of one version or of what an alias leads to."""
+    paths = (f"{prefix}/{{name}}{suffix}", f"{prefix}/{{name}}/versions/{{version}}{suffix}")
+    return [Route(method, path, Access.act, summary, answer, app) for path in paths]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The route of a connection, and its path's parameters; None where no route has the path, or none the method."""
+
+    route: Route | None
+    access: Access
+    params: Mapping[str, str]
+    allowed: tuple[str, ...] = ()
+    """The methods of the path, if there is such a path."""
+
+
+class RoutingTable:
+    """The routes of an application; the first that fits counts."""
+
+    def __init__(self, routes: Iterable[Route]) -> None:
+        self.routes = tuple(routes)
+        self._patterns = [
+            (re.compile(PARAMETER.sub(r"(?P<\1>[^/]+)", re.escape(each.path))), each) for each in self.routes
+        ]
+        self._remembered: dict[tuple[str, str], Found] = {}
+
+    def find(self, method: str, path: str, accept: bytes) -> Found:
+        """Return the route of a connection with this `Accept` header.
+
+        A path with another method is guarded as its most guarded route is; one without any is for any key.
+        """
+        if method == "HEAD":  # whose reply's body the engine leaves out
+            method = GET
+        known = self._remembered.get((method, path))
+        if known is not None:
+            return known
+        wants_page = method == GET and b"text/html" in accept.lower() and b"json" not in accept
+        others: list[Route] = []
+        for pattern, route in self._patterns:
+            match = pattern.fullmatch(path)
+            if match is None or (route.method == WEBSOCKET) is not (method == WEBSOCKET):
+                continue
+            if route.is_page and not wants_page:
+                continue
+            if route.method == method:
+                found = Found(route, route.access, match.groupdict())
+                if route.app is not None and len(path) <= LONGEST_REMEMBERED and PATH.fullmatch(path) is not None:
+                    if len(self._remembered) >= PATHS_REMEMBERED:
+                        self._remembered.clear()
+                    self._remembered[method, path] = found
+                return found
+            others.append(route)
+        levels = {route.access for route in others} or {Access.act}
+        access = next(level for level in (Access.admin, Access.act, Access.open) if level in levels)
+        return Found(None, access, {}, tuple(sorted({route.method for route in others})))
