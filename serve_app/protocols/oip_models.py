@@ -156,11 +156,7 @@ def model_config(handler: RequestHandler, name: str, version: str | None) -> dic
         "default_model_filename": ONNX_FILE,
         "model_transaction_policy": {"decoupled": False},  # a request has one reply
     }
-    if handler.store().batcher_of(policy) is not None:
-        # So many are run at once as soon as they are there, without waiting for others.
-        most = policy.options.micro_batch
-        config["dynamic_batching"] = {"preferred_batch_size": [most], "max_queue_delay_microseconds": 0}
-    elif policy.is_stateful:
+    if policy.is_stateful:
         config["sequence_batching"] = _sequences(handler, policy)
     return config
 
@@ -219,7 +215,7 @@ def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
         "version": version,
         "last_inference": totals.last_answer_ms,
         "inference_count": totals.observations,
-        "execution_count": totals.runs,
+        "execution_count": totals.requests,
         "inference_stats": {
             "success": duration(totals.requests, totals.request_s),
             "fail": duration(totals.failures, 0.0),  # how long they took is not kept

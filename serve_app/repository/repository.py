@@ -28,7 +28,7 @@ from rlservo.serve_app.repository.object_storage import ObjectStorage, is_uri, p
 from rlservo.serve_app.repository.remote_repository import Key, RemoteRepository
 
 CACHE_BYTES = 10 << 30
-STORAGE_TIMEOUT_S = 15.0
+TIMEOUT_S = 30.0
 
 
 @dataclass
@@ -63,9 +63,12 @@ class Repository:
         *,
         cache: str | Path | None = None,
         cache_bytes: int = CACHE_BYTES,
-        storage_timeout_s: float = STORAGE_TIMEOUT_S,
+        timeout_s: float = TIMEOUT_S,
     ) -> None:
-        """`cache` is the folder that bundles behind URIs are fetched into. Raises UsageError."""
+        """`cache` is the folder that bundles behind URIs are fetched into. Raises UsageError.
+
+        Each call to a storage may take half of `timeout_s`, so that one that hangs is named before a look is given up.
+        """
         given = [place_of(place) for place in places]
         if not given:
             raise UsageError("no policy to serve: give at least one bundle folder")
@@ -73,13 +76,11 @@ class Repository:
         self._limits = limits
         self._seen: dict[tuple[str, str, str], Path] = {}
         """The folders of the last look, by name, version and hash."""
-        storages = [ObjectStorage(place, timeout_s=storage_timeout_s) for place in given if is_uri(place)]
+        storages = [ObjectStorage(place, timeout_s=timeout_s / 2) for place in given if is_uri(place)]
         self._remote: list[RemoteRepository] = []
         if storages:
             bundles = BundleCache(Path(cache) if cache is not None else default_folder() / "bundles", cache_bytes)
             self._remote = [RemoteRepository(storage, bundles, limits) for storage in storages]
-        self.patience_s = 3 * storage_timeout_s * len(storages)
-        """[s] by which a look through storages, each call with its time-out, may take longer than one on disk."""
 
     def available(self, *, needs_all: bool) -> dict[str, dict[str, str]]:
         """Return every bundle's hash by name and version, for a first plan.

@@ -229,29 +229,6 @@ def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str,
         end.cancel()
 
 
-def check_rows(bundle: Bundle, run: Run) -> None:
-    """Refuse to compute observations together if that is something else than one by one. Raises BundleError."""
-    inputs, _ = bundle.golden()
-    names = acting_outputs(bundle.contract)
-    rows = {tensor.name: np.resize(inputs[tensor.name], (3, *inputs[tensor.name].shape[1:]))
-            for tensor in bundle.contract.inputs}  # fmt: skip
-    try:
-        one_by_one = [
-            _run_in_time(bundle, run, names, {name: array[row : row + 1] for name, array in rows.items()})
-            for row in range(3)
-        ]
-        together = dict(zip(names, _run_in_time(bundle, run, names, rows), strict=True))
-        singly = {name: np.concatenate([each[index] for each in one_by_one]) for index, name in enumerate(names)}
-        for name in names:
-            _compare(bundle, name, together, singly, GOLDEN_RTOL, GOLDEN_ATOL)
-    except Exception as error:  # onnxruntime's own exceptions share no base but Exception
-        raise BundleError(
-            f"{bundle.path}: the graph computes three observations together differently than one by one "
-            f"({first_line(error)}): "
-            "leave micro_batch out of the policy's options"
-        ) from error
-
-
 def _compare(
     bundle: Bundle,
     name: str,

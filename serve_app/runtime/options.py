@@ -1,4 +1,4 @@
-"""Per-policy runtime options: out-of-bounds observations, action step limit, micro-batching.
+"""Per-policy runtime options: out-of-bounds observations, action step limit, exploring, recording.
 
 One small model, so that the server's settings and a deployment's file can hold it by name.
 """
@@ -27,12 +27,6 @@ class PolicyOptions(BaseModel):
 
     beyond_action_step: Literal["limit", "refuse"] = "limit"
     """Treatment of a larger step: limited with a warning, or refused."""
-
-    micro_batch: Annotated[int, Field(ge=0, le=1024)] = 0
-    """The most single observations that a server computes in one run of the network, of those that are there at the
-    same time; 0 and 1: each by itself. For large networks. A batch's sums are
-    formed in another order, so the last bits of an action may differ. These are computed one by one nevertheless:
-    policies with a memory or a `max_action_step`, and requests that explore or report on an episode."""
 
     explore: bool = True
     """Whether clients may ask for exploring actions, if their key allows it. A robot that must not explore asks for

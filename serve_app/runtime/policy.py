@@ -34,7 +34,6 @@ from rlservo.serve_app.runtime.loading import (
     check_copy,
     check_golden_vectors,
     check_graph,
-    check_rows,
     leaves_value_out,
     open_graph,
 )
@@ -348,10 +347,6 @@ class Policy(Closeable):
         run: Callable[..., Sequence[Any]] = self._open().run  # an action is dense: no sparse tensors, no maps
         names = list(self._action_checks)
         return lambda feed: dict(zip(names, run(names, feed), strict=True))
-
-    def check_rows(self) -> None:
-        """Raise BundleError if the network computes several observations otherwise than each by itself."""
-        check_rows(self._bundle, self._open().run)
 
     def fingerprint(self, inputs: Mapping[str, NDArray[Any]]) -> bytes:
         """Return a hash of the observation in the network's inputs (`parse`, `Step.inputs`)."""

@@ -54,7 +54,6 @@ class Totals:
     requests: int
     failures: int
     observations: int
-    runs: int  # of the network
     request_s: float
     inference_s: float
     last_answer_ms: int  # since 1970; 0 if there was none
@@ -63,7 +62,7 @@ class Totals:
 class Answers:
     """Answered requests to one policy's version over one protocol."""
 
-    __slots__ = ("batch", "count", "inference", "last_s", "latency", "observations", "runs")
+    __slots__ = ("batch", "count", "inference", "last_s", "latency", "observations")
 
     def __init__(self, latency: Histogram, inference: Histogram, batch: Histogram) -> None:
         self.latency = latency
@@ -71,7 +70,6 @@ class Answers:
         self.batch = batch
         self.count = 0
         self.observations = 0
-        self.runs = 0.0  # of the network; of one that several requests share, each has its part
         self.last_s = 0.0  # since 1970
 
 
@@ -89,7 +87,7 @@ class Metrics(Collector):
 
         latency = "From the first byte to the answer, of requests that got one"
         self._latency = histogram("rlservo_request_seconds", latency, "protocol", SECONDS)
-        inference = "Checking the observation, running the network (alone or for several requests), checking the action"
+        inference = "Checking the observation, running the network, checking the action"
         self._inference = histogram("rlservo_inference_seconds", inference, "protocol", SECONDS)
         batch = "Observations per request, of requests that bring a batch"
         self._batch = histogram("rlservo_batch_size", batch, "protocol", BATCHES)
@@ -122,7 +120,6 @@ class Metrics(Collector):
             answers.batch.observe(decision.batch)
         answers.count += 1
         answers.observations += decision.batch or 1
-        answers.runs += 1 / decision.sharers
         answers.last_s = time.time()
 
     def count_failure(self, protocol: str, policy: str, version: str, code: str) -> None:
@@ -157,7 +154,6 @@ class Metrics(Collector):
             requests=sum(answers.count for answers in found),
             failures=sum(failed),
             observations=sum(answers.observations for answers in found),
-            runs=round(sum(answers.runs for answers in found)),
             request_s=sum(_sum_of(answers.latency) for answers in found),
             inference_s=sum(_sum_of(answers.inference) for answers in found),
             last_answer_ms=round(1e3 * max((answers.last_s for answers in found), default=0.0)),

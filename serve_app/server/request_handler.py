@@ -3,10 +3,8 @@
 A protocol is a `Codec` and a transport. The transport (`http_endpoint.py`, `websocket_stream.py`, `oip_grpc.py`) makes
 a `Request` and calls `RequestHandler.answer`, which calls the codec; what it raises the transport encodes as an error.
 
-A decision runs in the event loop from its first line to its last (or pauses for the rest of its turn:
-`micro_batching.py`). So requests do not wait for each other in a queue of ours: they wait as tasks that the loop has
-made and not yet run. All that arrived while the loop was busy run in one turn of it, a *burst*. Its length is the
-queue, its beginning when each of them had arrived at the latest. That is known for the price of one callback per burst.
+A decision runs in the event loop from its first line to its last. So requests do not wait for each other in a queue of
+ours: they wait as tasks that the loop has made and not yet run.
 """
 
 from __future__ import annotations
@@ -16,7 +14,6 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from rlservo.export.contract.errors import (
@@ -275,9 +272,6 @@ class RequestHandler:
             self._check_batch(store, request)
         if request.episode is not None or request.stream is not None:
             decision = await self.episodes.act(store, request)
-        elif store.batches and not request.explore:
-            check = partial(_check_again, request, time.perf_counter(), self.admission.max_wait_s)
-            decision = await store.act_together(name, request.version, obs, label=request.label, check=check)
         else:
             decision = store.act(
                 name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
@@ -398,11 +392,3 @@ def _session_store(settings: ServerSettings) -> RedisSessions | None:
     from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only servers with several workers need it
 
     return RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=settings.max_queue_ms / 1e3)
-
-
-def _check_again(request: Request, since: float, limit_s: float) -> None:
-    """Check an observation that was gathered for a batch, and waited for those before it."""
-    if time.perf_counter() - since > limit_s:
-        raise LateError(f"the observation waited longer than {limit_s * 1e3:g} ms for its batch: send a newer one")
-    if request.deadline_ms is not None:
-        check_deadline(request)

@@ -65,12 +65,6 @@ def versions(handler: RequestHandler) -> None:
     for name, version, policy in handler.policies():
         which, is_default = {"policy": name, "version": version}, version == handler.store().default(name)
         show.gauge("rlservo_policy_loaded", "1 for the default version, 0 for the others", is_default, **which)
-        batcher = handler.store().batcher_of(policy)
-        if batcher is not None:
-            runs = "Runs of the network for single observations"
-            show.counter("rlservo_micro_batch_runs", runs, batcher.runs, **which)
-            computed = "Single observations computed in those runs"
-            show.counter("rlservo_micro_batch_observations", computed, batcher.observations, **which)
         drift = policy.drift
         if drift is None:
             continue

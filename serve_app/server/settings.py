@@ -143,11 +143,9 @@ class ServerSettings(BaseModel):
     """Folder or URI in whose `.plan` the aliases, canaries and shadows stand. By default the first of the places of
     policies that can be written, else the user's state folder (`$XDG_STATE_HOME/rlservo`)."""
 
-    scan_timeout_s: float = Field(10.0, gt=0, allow_inf_nan=False)
-    """[s] A look through the policies' folders that takes longer is given up: a file system may hang."""
-
     load_timeout_s: float = Field(30.0, gt=0, allow_inf_nan=False)
-    """[s] Loading and proving one version that takes longer is given up."""
+    """[s] Looking through the places of policies, loading and proving one version, and reading or writing the plan are
+    given up after this time: a file system or storage may hang. One call to object storage may take half of it."""
 
     cache: str | None = None
     """Folder of this machine into which versions of remote repositories (`rlservo serve s3://...`) are fetched;
@@ -155,15 +153,6 @@ class ServerSettings(BaseModel):
 
     cache_bytes: int = Field(10 << 30, ge=1 << 20)
     """Largest size of the cache: the least recently used versions are removed, those in use never."""
-
-    storage_timeout_s: float = Field(15.0, gt=0, allow_inf_nan=False)
-    """[s] A call to a remote repository (a list, a manifest, a block of a file) that takes longer is given up. Below
-    `load_timeout_s`."""
-
-    poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
-    """[s] Look through the places of policies this often, and load versions that are newer than those known, as
-    `rlservo policy load` does: ready, not in use. Off by default. Also set by `rlservo serve --poll`. The plan is read
-    twice a second, in object storage every 5 s, or at this interval if it is shorter."""
 
     @property
     def bundle_limits(self) -> BundleLimits:

@@ -41,22 +41,11 @@ def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> Ve
         limits,
         cache=settings.cache,
         cache_bytes=settings.cache_bytes,
-        storage_timeout_s=settings.storage_timeout_s,
+        timeout_s=settings.load_timeout_s,
     )
-    return VersionLoader(
-        repository,
-        load,
-        scan_timeout_s=settings.scan_timeout_s,
-        load_timeout_s=settings.load_timeout_s,
-    )
+    return VersionLoader(repository, load, timeout_s=settings.load_timeout_s)
 
 
 def plan_files(places: Sequence[str | Path], settings: ServerSettings) -> PlanFiles:
     """Return where the plan of these folders and URIs is kept, as the settings say. Raises UsageError."""
-    return PlanFiles(
-        places,
-        root=settings.plan,
-        cache=settings.cache,
-        timeout_s=settings.storage_timeout_s,
-        poll_s=settings.poll_s,
-    )
+    return PlanFiles(places, root=settings.plan, cache=settings.cache, timeout_s=settings.load_timeout_s)

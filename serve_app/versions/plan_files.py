@@ -23,12 +23,12 @@ from rlservo.export.contract.errors import UnavailableError
 from rlservo.export.contract.regular_files import blocks, open_regular
 from rlservo.serve_app.repository.bundle_cache import default_folder
 from rlservo.serve_app.repository.object_storage import ObjectStorage, is_uri, place_of
+from rlservo.serve_app.repository.repository import TIMEOUT_S
 from rlservo.serve_app.versions.serving_plan import Plan
 
 FOLDER = ".plan"
 FOLDER_POLL_S = 0.5
-FOLDER_TIMEOUT_S = 10.0
-STORAGE_POLL_S = 5.0  # at most: a poll for new versions that comes more often reads the plan as often
+STORAGE_POLL_S = 5.0
 MAX_PLAN_BYTES = 16 << 20  # of 1,000 policies it has 0.3 MB
 
 
@@ -37,7 +37,6 @@ class FolderStorage:
 
     def __init__(self, root: Path) -> None:
         self.uri = str(root)
-        self.timeout_s = 3.0
         self._root = root
 
     def read(self, name: str, most: int) -> tuple[bytes, str]:
@@ -91,18 +90,16 @@ class PlanFiles:
         *,
         root: str | None = None,
         cache: str | Path | None = None,
-        timeout_s: float = 15.0,
-        poll_s: float | None = None,
+        timeout_s: float = TIMEOUT_S,
     ) -> None:
         """`root` is a folder or URI for the plans instead of the places. Raises UsageError.
 
-        `cache` keeps a copy of what object storage gave last; `poll_s` is how often new versions are looked for.
+        `cache` keeps a copy of what object storage gave last; reading or writing a plan may take `timeout_s`.
         """
         self._places = [place_of(place) for place in places]
         self._root = None if root is None else place_of(root)
         self._cache = cache
-        self._timeout_s = timeout_s
-        self._poll_s = poll_s
+        self.timeout_s = timeout_s
 
     @property
     def place(self) -> str:
@@ -112,12 +109,7 @@ class PlanFiles:
     @property
     def poll_s(self) -> float:
         """[s] between looks for a new plan."""
-        return FOLDER_POLL_S if self._copy is None else min(STORAGE_POLL_S, self._poll_s or STORAGE_POLL_S)
-
-    @property
-    def timeout_s(self) -> float:
-        """[s] that reading or writing a plan may take."""
-        return 3 * self._timeout_s if any(map(is_uri, (self._root or "", *self._places))) else FOLDER_TIMEOUT_S
+        return FOLDER_POLL_S if self._copy is None else STORAGE_POLL_S
 
     def newest(self) -> Plan | None:
         """Return the newest plan, if there is one. Raises UnavailableError."""
@@ -149,7 +141,7 @@ class PlanFiles:
     @functools.cached_property
     def _storage(self) -> ObjectStorage | FolderStorage:
         root = self._root or _first_writable(self._places)
-        return ObjectStorage(root, timeout_s=self._timeout_s) if is_uri(root) else FolderStorage(Path(root))
+        return ObjectStorage(root, timeout_s=self.timeout_s / 2) if is_uri(root) else FolderStorage(Path(root))
 
     @functools.cached_property
     def _copy(self) -> Path | None:

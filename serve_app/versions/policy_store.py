@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import random
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,11 +23,9 @@ from rlservo.export.contract.errors import (
     UnknownVersionError,
     UsageError,
 )
-from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy, Step
-from rlservo.serve_app.versions.micro_batching import Batcher
 from rlservo.serve_app.versions.serving_plan import PolicyPlan
 
 
@@ -59,11 +57,10 @@ class Decision:
     """Inputs of the network, by tensor name `[batch, *shape]`."""
     name: str
     version: str
-    infer_ms: float  # [ms] checking the observation, the network (for all that it ran for), checking the action
+    infer_ms: float  # [ms] checking the observation, the network, checking the action
     batch: int | None = None  # how many observations there were; None for one that came alone
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
     episode: EpisodeNote | None = None
-    sharers: int = 1  # requests whose observations were computed in the same run of the network
     last_action: Mapping[str, NDArray[Any]] | None = None  # which the client gave, by tensor name `[batch, *shape]`
     is_repeat: bool = False  # the answer to a session's last request once more
 
@@ -98,13 +95,11 @@ class PolicyStore:
         plans: Mapping[str, PolicyPlan],
         *,
         changed: Iterable[str] = (),
-        replaces: PolicyStore | None = None,
     ) -> None:
         """Take loaded policies, and by name the plan that each is served by; those `changed` were served otherwise.
 
         A plan may name versions that are not among the policies; an alias, canary or shadow that leads to one is left
-        out. Raises UsageError when the default version is not there: no other takes its place. From a
-        store that this one `replaces` it keeps the micro-batching of the policies that both have.
+        out. Raises UsageError when the default version is not there: no other takes its place.
         """
         self.plans = plans
         self._changed = frozenset(changed)
@@ -112,15 +107,6 @@ class PolicyStore:
         for policy in sorted(policies, key=lambda each: version_key(each.contract.version)):
             loaded.setdefault(policy.contract.name, {})[policy.contract.version] = policy
         self._served = {name: _serve(name, versions, plans[name]) for name, versions in loaded.items()}
-        before: dict[Policy, Batcher] = {} if replaces is None else replaces._batchers
-        self._batchers: dict[Policy, Batcher] = {
-            policy: before.get(policy) or Batcher(policy.network(), policy.options.micro_batch)
-            for versions in loaded.values()
-            for policy in versions.values()
-            if _wants_batches(policy)
-        }
-        self.batches = bool(self._batchers)
-        """Whether some policy computes together what comes at the same time."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -207,10 +193,6 @@ class PolicyStore:
         """Return the version that computes along, if there is one."""
         return self._find(name).shadow
 
-    def batcher_of(self, policy: Policy) -> Batcher | None:
-        """Return what gathers the single observations for a policy; None where each is computed by itself."""
-        return self._batchers.get(policy)
-
     def act(
         self,
         name: str,
@@ -227,42 +209,8 @@ class PolicyStore:
         """
         return take_step(self._stateless(name, version, label), obs, explore=explore, seed=seed)[0]
 
-    async def act_together(
-        self,
-        name: str,
-        version: str | None,
-        obs: Observation,
-        *,
-        label: str | None = None,
-        check: Callable[[], None] | None = None,
-    ) -> Decision:
-        """Decide as `act` does without exploring; in one run with the other requests if the policy's options allow it.
-
-        `check` is called again right before the network runs. Raises what it and `act` raise.
-        """
-        policy = self._stateless(name, version, label)
-        batcher = self._batchers.get(policy)
-        if batcher is None:
-            return take_step(policy, obs)[0]
-        try:
-            started = time.perf_counter()
-            feed, batch, notices = policy.parse(obs)
-            parse_ms = (time.perf_counter() - started) * 1e3
-            rows = len(next(iter(feed.values())))
-            single = rows == 1  # also a batch of one: the Open Inference Protocol has no other
-            computed = await batcher.compute(feed, check) if single else batcher.compute_now(feed)
-            started = time.perf_counter()
-            action = policy.build_action(computed.outputs, batch=batch)
-        except Exception as error:
-            blame(error, policy.contract.version)
-            raise
-        infer_ms = parse_ms + computed.milliseconds + (time.perf_counter() - started) * 1e3
-        version, size, sharers = policy.contract.version, rows if batch else None, computed.requests
-        return Decision(action, policy, feed, name, version, infer_ms, size, notices, sharers=sharers)
-
     def close(self) -> None:
-        """Close every policy; what is waiting to be computed with others is computed."""
-        self._batchers = {}
+        """Close every policy."""
         for served in self._served.values():
             for policy in served.versions.values():
                 policy.close()
@@ -296,13 +244,6 @@ def _serve(name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> _Serv
         if policy is not None and policy is not default:
             shadow = Shadow(default.contract.version, policy.contract.version, policy.clone())
     return _Served(plan, versions, default, canary, share, shadow)
-
-
-def _wants_batches(policy: Policy) -> bool:
-    """Return whether single observations are computed together: the options allow it, and nothing else goes in."""
-    contract = policy.contract
-    observed = leaf_specs(contract.observation_space, "obs")
-    return policy.options.micro_batch > 1 and not policy.is_stateful and len(contract.inputs) == len(observed)
 
 
 def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision, Step]:
@@ -362,7 +303,4 @@ def load_policy(
         return Policy.load(folder, threads=threads, limits=limits)
     name = read_contract(folder, limits).name
     chosen = options.get(name, options.get("*", DEFAULT_OPTIONS))
-    policy = Policy.load(folder, threads=threads, options=chosen, limits=limits)
-    if _wants_batches(policy):
-        policy.check_rows()
-    return policy
+    return Policy.load(folder, threads=threads, options=chosen, limits=limits)

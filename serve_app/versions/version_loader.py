@@ -19,7 +19,7 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.repository.remote_repository import Key
-from rlservo.serve_app.repository.repository import Repository, raise_all
+from rlservo.serve_app.repository.repository import TIMEOUT_S, Repository, raise_all
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.serving_plan import PolicyPlan, ServedConfig
@@ -39,17 +39,12 @@ class VersionLoader:
         repository: Repository,
         load: Callable[[Path], Policy] = Policy.load,
         *,
-        scan_timeout_s: float = 10.0,
-        load_timeout_s: float = 30.0,
+        timeout_s: float = TIMEOUT_S,
     ) -> None:
-        """`load` loads and proves one bundle; raises BundleError.
-
-        `scan_timeout_s` is for one look through the repository, `load_timeout_s` for one version.
-        """
+        """`load` loads and proves one bundle; raises BundleError. `timeout_s` is for one look and for one version."""
         self._repository = repository
         self._load_bundle = load
-        self._scan_timeout_s = scan_timeout_s
-        self._load_timeout_s = load_timeout_s
+        self._timeout_s = timeout_s
         self._calls = BlockingCalls()
         self._loaded: weakref.WeakValueDictionary[Loadable, Policy] = weakref.WeakValueDictionary()
         self._tasks: dict[Loadable, asyncio.Task[Policy]] = {}
@@ -95,10 +90,10 @@ class VersionLoader:
             what = f"loading policy '{name}' version {version}"
             task = asyncio.create_task(self._calls.run(self._load_accepted, *key, timeout_s=None, what=what))
             self._tasks[key] = task
-        done, _ = await asyncio.wait([task], timeout=self._load_timeout_s)
+        done, _ = await asyncio.wait([task], timeout=self._timeout_s)
         if not done:
             raise UnavailableError(
-                f"loading policy '{name}' version {version} took longer than {self._load_timeout_s:g} s and was given "
+                f"loading policy '{name}' version {version} took longer than {self._timeout_s:g} s and was given "
                 "up: does the file system hang?"
             )
         self._tasks.pop(key, None)
@@ -138,8 +133,7 @@ class VersionLoader:
 
     async def _look(self, function: Callable[..., Result], *arguments: Any) -> Result:
         what = "looking through the policies' folders"
-        timeout_s = self._scan_timeout_s + self._repository.patience_s
-        return await self._calls.run(function, *arguments, timeout_s=timeout_s, what=what)
+        return await self._calls.run(function, *arguments, timeout_s=self._timeout_s, what=what)
 
     def _load_accepted(self, name: str, version: str, digest: str) -> Policy:
         """Load the bundle that was accepted, in a thread."""

@@ -5,7 +5,9 @@ That one is ended by a second Ctrl-C, at once and with nothing left.
 
 from __future__ import annotations
 
+import os
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -38,7 +40,7 @@ def test_published_versions_are_served_also_when_the_storage_is_away(storage: St
         "RLSERVO_CACHE": str(tmp_path / "cache"),
         "RLSERVO_LOG_FILE": str(log),
     }
-    command = [*RLSERVO, "serve", storage.uri, "--port", str(port), "--poll", "1"]
+    command = [*RLSERVO, "serve", storage.uri, "--port", str(port)]
 
     def versions() -> list[str]:
         (policy,) = ask(port, "GET", "/v1/policies")[1]["policies"]
@@ -49,6 +51,11 @@ def test_published_versions_are_served_also_when_the_storage_is_away(storage: St
         status, first = ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS})
         assert status == 200 and first["version"] == "1"
         publish(load_bundle(write_box_policy(tmp_path, version="2", seed=2)), storage.uri)
+        loaded = subprocess.run(
+            [*RLSERVO, "policy", "load", "ur5", "--repository", storage.uri],
+            env=os.environ | environment, capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        assert loaded.returncode == 0, loaded.stderr
         deadline = time.monotonic() + 120
         while versions() != ["1", "2"] and time.monotonic() < deadline:
             time.sleep(0.2)

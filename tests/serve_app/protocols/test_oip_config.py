@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -12,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.oip_grpc import _numbered
 from rlservo.serve_app.protocols.oip_messages import messages
@@ -25,7 +23,6 @@ from servers import exchange
 from stores import load_store
 
 OPTIONS = {
-    "gathered": PolicyOptions(micro_batch=16),
     "careful": PolicyOptions(max_action_step=0.1),
     "*": PolicyOptions(),
 }
@@ -40,8 +37,7 @@ def store(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> PolicyStore:
     root = tmp_path_factory.mktemp("more")
-    for name in ("gathered", "careful"):
-        box_policy(root, name=name)
+    box_policy(root, name="careful")
     leaky_policy(root)
     return load_store(policies, root, options=OPTIONS)
 
@@ -80,10 +76,8 @@ def test_the_configuration_says_how_a_policy_is_run(ask: Ask) -> None:
     assert discrete["input"] == [{"name": "obs", "data_type": "TYPE_INT64", "dims": []}]
 
 
-def test_the_configuration_says_what_is_computed_together_and_what_needs_a_sequence(ask: Ask) -> None:
-    gathered = ask("/v2/models/gathered/config")[1]
-    assert gathered["dynamic_batching"] == {"preferred_batch_size": [16], "max_queue_delay_microseconds": 0}
-    assert "sequence_batching" not in gathered
+def test_the_configuration_says_what_needs_a_sequence(ask: Ask) -> None:
+    assert "sequence_batching" not in ask("/v2/models/ur5/config")[1]
     leaky = ask("/v2/models/leaky/config")[1]
     assert leaky["input"][1] == {"name": "state_in.h", "data_type": "TYPE_FP32", "dims": [2], "optional": True}
     assert "optional" not in leaky["input"][0]
@@ -149,26 +143,7 @@ def test_statistics_count_what_was_answered_over_every_protocol(ask: Ask) -> Non
     versions = ask("/v2/models/ur5/stats")[1]["model_stats"]
     assert [each["version"] for each in versions] == ["1", "2", "10"] and versions[2] == after
     everything = ask("/v2/models/stats")[1]["model_stats"]
-    assert {each["name"] for each in everything} == {"careful", "gathered", "gridworld", "leaky", "ur5"}
-
-
-def test_a_run_that_several_requests_share_is_one_execution(store: PolicyStore) -> None:
-    handler = create_app(lambda: store, ServerSettings()).handler
-    batcher = store.batcher_of(store.get("gathered"))
-    assert batcher is not None
-
-    async def crowd() -> list[Any]:
-        batcher._several = True  # as if several had come in the turn before
-        obs = np.zeros(27, np.float32)
-        requests = [Request("oip", "gathered", None, time.perf_counter(), obs=obs) for _ in range(6)]
-        return await asyncio.gather(*map(handler.decide, requests))
-
-    ran = batcher.runs
-    for decision in asyncio.run(crowd()):
-        handler.metrics.record_answer("oip", decision, 0.001)
-    assert batcher.runs - ran == 1
-    (found,) = statistics(handler, "gathered")
-    assert (found["inference_count"], found["execution_count"]) == (6, 1)
+    assert {each["name"] for each in everything} == {"careful", "gridworld", "leaky", "ur5"}
 
 
 @pytest.mark.parametrize("kind", ["config", "stats"])

@@ -73,7 +73,7 @@ def root(policies: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def patience(request: pytest.FixtureRequest) -> dict[str, float]:
     """Time that the server waits for the file system."""
-    return {"scan_timeout_s": 60.0, "load_timeout_s": 60.0, **getattr(request, "param", {})}
+    return {"load_timeout_s": 60.0, **getattr(request, "param", {})}
 
 
 @pytest.fixture
@@ -359,8 +359,8 @@ def test_while_a_file_system_does_not_answer_all_else_goes_on(
 
 @pytest.mark.parametrize(
     ("name", "patience", "sentence"),
-    [("contract.json", {"scan_timeout_s": 0.5}, "looking through the policies' folders took longer than 0.5 s and was"),
-     ("policy.onnx", {"scan_timeout_s": 2.0, "load_timeout_s": 0.5}, "loading policy 'ur5' version 10 took longer")],
+    [("contract.json", {"load_timeout_s": 0.5}, "looking through the policies' folders took longer than 0.5 s and was"),
+     ("policy.onnx", {"load_timeout_s": 0.5}, "loading policy 'ur5' version 10 took longer")],
     indirect=["patience"],
 )  # fmt: skip
 def test_a_file_system_that_hangs_is_given_up_with_a_few_threads_at_most(
@@ -402,7 +402,7 @@ def test_a_process_whose_files_hang_follows_what_others_change_meanwhile(
     async def run() -> None:
         controls: list[PlanFollower] = []
         for folder in (root, elsewhere):
-            loader = VersionLoader(Repository([folder]), load_timeout_s=1)
+            loader = VersionLoader(Repository([folder]), timeout_s=1)
             controls.append(PlanFollower(loader, plan_files(root), replica=folder.name))
         config = {"policies": {"ur5": {"versions": ["1"]}, "gridworld": {}}, "unlisted": "ignore"}
         for control in controls:
@@ -437,7 +437,7 @@ def test_a_start_does_not_wait_in_silence_for_a_file_system_that_hangs(
 ) -> None:
     stalled = stall(root / "ur5" / "1" / "contract.json")
     with pytest.raises(UnavailableError, match=r"looking through the policies' folders took longer than 0.3 s"):
-        load_served([root], ServedConfig(), ServerSettings(scan_timeout_s=0.3))
+        load_served([root], ServedConfig(), ServerSettings(load_timeout_s=0.3))
     stalled.go_on.set()
 
 

@@ -22,8 +22,8 @@ def test_arguments_win_over_the_environment_over_the_defaults() -> None:
         ({"threads": 0}, {}, "the setting 'threads' is not usable"),
         (
             {},
-            {"RLSERVO_POLICY_OPTIONS": '{"ur5": {"micro_bach": 16}}'},
-            r"RLSERVO_POLICY_OPTIONS is not usable at 'ur5.micro_bach': .*known: out_of_bounds, .*, record$",
+            {"RLSERVO_POLICY_OPTIONS": '{"ur5": {"out_of_bound": 16}}'},
+            r"RLSERVO_POLICY_OPTIONS is not usable at 'ur5.out_of_bound': .*known: out_of_bounds, .*, record$",
         ),
         ({"colour": 1}, {}, "known: threads"),
     ],

@@ -385,7 +385,7 @@ def test_a_version_that_takes_too_long_is_there_when_it_is_asked_for_again(folde
         return Policy.load(bundle)
 
     async def run() -> None:
-        loader = VersionLoader(Repository([folder]), slowly, load_timeout_s=0.5)
+        loader = VersionLoader(Repository([folder]), slowly, timeout_s=0.5)
         control = PlanFollower(loader, PlanFiles([folder]))
         await control.configure(config("1", production="1"))
         with pytest.raises(UnavailableError, match=r"loading policy 'ur5' version 2 took longer than 0.5 s"):
