@@ -76,7 +76,7 @@ LONGEST = (
     "tests/system/test_remote_repository.py",
     # of `make quick`
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
-    "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_api_key_file.py",
+    "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_current_keys.py",
 )  # fmt: skip
 
 # Servers and Rays that tests share. An unused one still takes a tenth of a core or more.

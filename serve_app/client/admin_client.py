@@ -11,8 +11,8 @@ from urllib.parse import urlsplit
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.client.http_transport import Transport, encode
 from rlservo.serve_app.interface import Closeable
+from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.admin_key_file import key_file, read_key
-from rlservo.serve_app.wire.loopback import is_loopback
 
 KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
 LOOK_TIMEOUT_S = 10.0  # nothing is loaded for it

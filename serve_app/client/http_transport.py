@@ -25,8 +25,8 @@ with needs_extra("client", what="the HTTP client"):
     import httpcore
 
 from rlservo.serve_app.client.deadline_backend import DeadlineBackend
-from rlservo.serve_app.client.error_replies import decode_error, excerpt
-from rlservo.serve_app.client.server_address import host_of, parse_address
+from rlservo.serve_app.client.replies import decode_error, excerpt
+from rlservo.serve_app.wire.addresses import host_of, parse_address
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 try:  # three times faster than the standard library on an image; not a requirement of the client

@@ -28,12 +28,11 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.serve_app.client.client_episode import ClientEpisode
-from rlservo.serve_app.client.error_replies import decode_error, error_of
 from rlservo.serve_app.client.remote_policy import RemotePolicy
-from rlservo.serve_app.client.replies import decode_action
-from rlservo.serve_app.client.server_address import parse_address
+from rlservo.serve_app.client.replies import decode_action, decode_error, error_of
 from rlservo.serve_app.client.websocket_connection import BrokenError, HandshakeError, WebSocket
 from rlservo.serve_app.interface import Observation
+from rlservo.serve_app.wire.addresses import parse_address
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 if TYPE_CHECKING:

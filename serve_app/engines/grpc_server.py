@@ -12,7 +12,7 @@ from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.protocols.oip_grpc import METHODS, Grpc
 from rlservo.serve_app.protocols.oip_messages import SERVICE
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.wire.loopback import is_loopback
+from rlservo.serve_app.wire.addresses import is_loopback
 
 LONGEST_S = 86400.0  # [s] gRPC expresses "no deadline" as one far away
 DRAIN_S = 5.0

@@ -38,13 +38,13 @@ from rlservo.serve_app.engines.serving import Serving
 from rlservo.serve_app.repository.object_storage import place_of
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
+from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.metrics import FOLDER_VARIABLE, shared_by_workers
-from rlservo.serve_app.server.request_log import configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.serving_plan import ServedConfig
+from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.asgi import ASGIApp, Receive, Scope, Send
-from rlservo.serve_app.wire.loopback import is_loopback
 
 logger = logging.getLogger(__name__)
 

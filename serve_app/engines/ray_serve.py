@@ -27,10 +27,10 @@ from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY
 from rlservo.serve_app.repository.object_storage import place_of
 from rlservo.serve_app.server.api_keys import check_exposure
-from rlservo.serve_app.server.request_log import configure
+from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.serving_plan import ServedConfig
-from rlservo.serve_app.wire.loopback import is_loopback
+from rlservo.serve_app.wire.addresses import is_loopback
 
 logger = logging.getLogger(__name__)
 

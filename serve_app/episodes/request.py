@@ -1,4 +1,4 @@
-"""Request for an action: one object that every protocol fills, and what it says of its episode."""
+"""Request for an action, which every protocol fills, with its episode; and the fields of its reply."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 from rlservo.export.contract.errors import DeadlineError
 from rlservo.serve_app.episodes.session import Session
+from rlservo.serve_app.versions.policy_store import Decision
 
 SessionId: TypeAlias = str | int
 """Triton's clients number their sequences; 7 and "7" are two."""
@@ -128,3 +129,34 @@ def check_deadline(request: Request) -> None:
             f"the deadline of {request.deadline_ms:g} ms passed before the policy was asked: nothing computed",
             {"deadline_ms": request.deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": request.seq},
         )
+
+
+def reply_fields(request: Request, decision: Decision) -> dict[str, Any]:
+    """Return a reply's fields besides the action; empty ones are left out.
+
+    `policy`, `version`, `infer_ms`, `seq`, `warnings` (a tuple of sentences), `session_id`, `session_step`, `state`
+    (a dict of arrays, with what `carried_state.py` adds), `timestamp`, `received_at`, `sent_at`.
+    """
+    fields: dict[str, Any] = {
+        "policy": decision.name,
+        "version": decision.version,
+        "infer_ms": round(decision.infer_ms, 4),
+    }
+    if request.seq is not None:
+        fields["seq"] = request.seq
+    if decision.notices:
+        fields["warnings"] = decision.notices
+    episode = decision.episode
+    if episode is not None:
+        if episode.session_id is not None:
+            fields["session_id"] = episode.session_id
+        if episode.step is not None:
+            fields["session_step"] = episode.step
+        if episode.state is not None:
+            fields["state"] = episode.state
+    if request.timestamp is not None:
+        now = time.time()
+        fields["timestamp"] = request.timestamp
+        fields["received_at"] = now - (time.perf_counter() - request.received)
+        fields["sent_at"] = now
+    return fields

@@ -13,7 +13,7 @@ from rlservo.serve_app.protocols.oip_infer import BINARY
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access
-from rlservo.serve_app.server.audit import OK
+from rlservo.serve_app.server.logs import OK
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed, Command, Load, Unload, parse
 from rlservo.serve_app.versions.plan_follower import PlanFollower

@@ -46,7 +46,7 @@ from rlservo.serve_app.server.access_checks import (
     header_text,
 )
 from rlservo.serve_app.server.api_keys import Access, Key
-from rlservo.serve_app.server.audit import AuditEntry
+from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 

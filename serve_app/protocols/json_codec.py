@@ -23,6 +23,7 @@ from rlservo.serve_app.episodes.request import (
     REQUEST_FIELDS,
     Episode,
     Request,
+    reply_fields,
 )
 from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type
@@ -31,7 +32,6 @@ from rlservo.serve_app.protocols.routes import GET, POST, Call, Route, of_policy
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
-from rlservo.serve_app.server.reply_fields import reply_fields
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.asgi import Receive

@@ -14,10 +14,9 @@ from typing import Any
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RequestError, TooLargeError
 from rlservo.export.contract.spaces import DictSpec
-from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request
+from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request, reply_fields
 from rlservo.serve_app.protocols.json_codec import parse_episode, parse_options
 from rlservo.serve_app.server.content_bounds import SMALL, check_length
-from rlservo.serve_app.server.reply_fields import reply_fields
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.asgi import Message

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, OPTIONS, Episode, Request, SessionId
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, OPTIONS, Episode, Request, SessionId, reply_fields
 from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type, too_large
 from rlservo.serve_app.protocols.json_codec import parse_episode, parse_finite, parse_options
@@ -40,7 +40,6 @@ from rlservo.serve_app.protocols.oip_tensors import (
 from rlservo.serve_app.protocols.routes import POST, Route, of_policy
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
-from rlservo.serve_app.server.reply_fields import reply_fields
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.asgi import Receive

@@ -10,7 +10,7 @@ from typing import TypeAlias
 from rlservo.serve_app.protocols.http_errors import Headers
 from rlservo.serve_app.server.access_checks import PATH
 from rlservo.serve_app.server.api_keys import Access
-from rlservo.serve_app.server.audit import AuditEntry
+from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.wire.asgi import ASGIApp
 
 GET, POST, WEBSOCKET = "GET", "POST", "WEBSOCKET"

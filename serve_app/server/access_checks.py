@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
 from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Keys, Role
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.wire.loopback import is_loopback
+from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.server.api_key_file import CurrentKeys
+    from rlservo.serve_app.server.current_keys import CurrentKeys
     from rlservo.serve_app.wire.asgi import Scope
 
 # Every path of ours can be written in it. What needs escaping, or is read differently by different programs, is not

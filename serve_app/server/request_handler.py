@@ -9,7 +9,6 @@ ours: they wait as tasks that the loop has made and not yet run.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import time
@@ -19,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from rlservo.export.contract.errors import (
     ForbiddenError,
     InternalError,
-    LateError,
     ObservationError,
     OverloadedError,
     RequestError,
@@ -31,12 +29,12 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import ClientGoneError, Episode, Request, check_deadline
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.api_key_file import CurrentKeys
+from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
-from rlservo.serve_app.server.loop_clock import LoopClock
+from rlservo.serve_app.server.content_bounds import count_rows, most_rows
+from rlservo.serve_app.server.current_keys import CurrentKeys
+from rlservo.serve_app.server.logs import FIELDS, RequestLog
 from rlservo.serve_app.server.metrics import Metrics
-from rlservo.serve_app.server.request_log import FIELDS, RequestLog
-from rlservo.serve_app.server.row_count import count_rows, most_rows
 from rlservo.serve_app.server.settings import MEMORY, ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
@@ -72,76 +70,6 @@ class Codec(Protocol[Source, Reply]):
     def encode(self, request: Request, decision: Decision) -> Reply:
         """Return the reply."""
         ...
-
-
-class Admission:
-    """Refuses what came too late, or what is too much for one event loop."""
-
-    def __init__(self, settings: ServerSettings) -> None:
-        """Take the limits: of a burst, of the wait before and in it, of bodies half sent, of streams."""
-        self._max_queued = settings.max_ongoing_requests
-        self.max_wait_s = settings.max_queue_ms / 1e3
-        self._max_incoming = settings.max_incoming
-        self._max_streams = settings.max_streams
-        self.loop_clock = LoopClock(self.max_wait_s)
-        self._burst = 0
-        self._burst_began = 0.0
-        self.incoming = 0
-        self.streams = 0
-        self.longest = 0  # the longest burst so far
-
-    def check_age(self) -> None:
-        """Raise LateError for a request that may have waited too long to be read."""
-        now = time.perf_counter()
-        if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > self.max_wait_s:
-            raise LateError(
-                f"the server was blocked for more than {self.max_wait_s * 1e3:g} ms, and the observation may be as "
-                "old: send a newer one"
-            )
-
-    def enter(self) -> float:
-        """Return when this request had arrived at the latest (`time.perf_counter`).
-
-        Raises OverloadedError or LateError.
-        """
-        self.check_age()
-        now = time.perf_counter()
-        if self._burst == 0:
-            self._burst_began = now
-            asyncio.get_running_loop().call_soon(self._end_burst)
-        self._burst += 1
-        if self._burst > self._max_queued:
-            raise OverloadedError(f"more than {self._max_queued} requests are waiting in this replica: try again")
-        if now - self._burst_began > self.max_wait_s:
-            raise OverloadedError(
-                f"requests wait longer than {self.max_wait_s * 1e3:g} ms in this replica: try again shortly"
-            )
-        return self._burst_began
-
-    def _end_burst(self) -> None:
-        self.longest = max(self.longest, self._burst)
-        self._burst = 0
-
-    @contextlib.contextmanager
-    def reading_body(self) -> Iterator[None]:
-        """Count a request whose body has come in part. Raises OverloadedError."""
-        if self.incoming >= self._max_incoming:
-            raise OverloadedError(f"{self.incoming} requests are still being sent to this server: try again shortly")
-        self.incoming += 1
-        try:
-            yield
-        finally:
-            self.incoming -= 1
-
-    def open_stream(self) -> None:
-        """Count an open stream. Raises OverloadedError."""
-        if self.streams >= self._max_streams:
-            raise OverloadedError(f"{self.streams} streams are open in this replica: close one, or try again shortly")
-        self.streams += 1
-
-    def close_stream(self) -> None:
-        """Count it no longer."""
-        self.streams -= 1
 
 
 class RequestHandler:

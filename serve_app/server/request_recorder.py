@@ -28,7 +28,7 @@ from rlservo.serve_app.runtime.exploration import Draw
 from rlservo.serve_app.runtime.input_numbers import parse_array
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import without_keys
-from rlservo.serve_app.server.row_count import count_rows
+from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 

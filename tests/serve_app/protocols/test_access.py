@@ -26,7 +26,7 @@ from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.routes import WEBSOCKET
 from rlservo.serve_app.protocols.status_page import FOLDER
 from rlservo.serve_app.server.api_keys import Access, new_key
-from rlservo.serve_app.server.request_log import FIELDS, configure
+from rlservo.serve_app.server.logs import FIELDS, configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 

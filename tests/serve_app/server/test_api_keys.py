@@ -18,12 +18,12 @@ from websockets.exceptions import InvalidStatus
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.access_checks import AccessChecks, Hosts, find_key, fold_headers
-from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Access, Keys, Role, check_exposure, new_key
+from rlservo.serve_app.server.current_keys import CurrentKeys
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.wire.loopback import is_loopback
+from rlservo.serve_app.wire.addresses import is_loopback
 from servers import exchange
 from stores import load_store
 

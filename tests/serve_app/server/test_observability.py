@@ -23,7 +23,7 @@ from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.drift import EVERY, Drift
-from rlservo.serve_app.server.request_log import LOGGER, configure
+from rlservo.serve_app.server.logs import LOGGER, configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack
 from servers import exchange

@@ -24,8 +24,8 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server import api_key_file
 from rlservo.serve_app.server.access_checks import find_key
-from rlservo.serve_app.server.api_key_file import CurrentKeys
 from rlservo.serve_app.server.api_keys import Keys, new_key
+from rlservo.serve_app.server.current_keys import CurrentKeys
 from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore

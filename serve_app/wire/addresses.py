@@ -1,11 +1,22 @@
-"""Address of a policy server, as a client is given it."""
+"""Addresses of servers, and whether only this machine reaches them."""
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Mapping
 from urllib.parse import SplitResult, urlsplit
 
 from rlservo.export.contract.errors import UsageError
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a server that listens on `host`."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:  # a name: wherever it points
+        return False
 
 
 def parse_address(url: str, schemes: Mapping[str, str]) -> str:

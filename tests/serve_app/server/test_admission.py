@@ -8,7 +8,7 @@ import time
 import pytest
 
 from rlservo.export.contract.errors import LateError
-from rlservo.serve_app.server.loop_clock import SETTLE_S
+from rlservo.serve_app.server.admission import SETTLE_S
 from rlservo.serve_app.server.request_handler import Admission
 from rlservo.serve_app.server.settings import ServerSettings
 

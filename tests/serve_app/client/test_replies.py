@@ -16,8 +16,8 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.serve_app.client.error_replies import decode_error, error_of
 from rlservo.serve_app.client.http_transport import DroppedError  # noqa: F401 - one that inherits its code
+from rlservo.serve_app.client.replies import decode_error, error_of
 from rlservo.serve_app.protocols.http_errors import error_answer
 
 

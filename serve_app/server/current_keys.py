@@ -1,8 +1,9 @@
-"""File of API keys, read again while the server runs, by every replica for itself.
+"""API keys in use: read from their file again while the server runs, and limited in rate, by every process for itself.
 
 The file is read twice a second in a thread of its own: a stat or read of a file system that hangs must not stop those
 who act. Its whole content is compared, so it does not matter how it was changed: written in place, renamed over,
-or behind the symbolic links that Kubernetes swaps. What would refuse the start changes nothing, and is said once.
+or behind the symbolic links that Kubernetes swaps. Content that would
+refuse a start changes nothing, and is logged once.
 """
 
 from __future__ import annotations
@@ -11,12 +12,41 @@ import logging
 import threading
 import time
 import weakref
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.server.api_keys import Keys, read_key_file
-from rlservo.serve_app.server.rate_limits import RateLimits
+from rlservo.export.contract.errors import RateLimitError, UsageError
+from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, read_key_file
 from rlservo.serve_app.server.settings import ServerSettings
+
+
+class RateLimits:
+    """Remaining requests of each key with a limit. Keys without one are never seen here."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._buckets: dict[str, tuple[float, float]] = {}  # by label: tokens, and when there were so many
+        self.refused: Counter[str] = Counter()
+        """Requests refused, by label."""
+
+    def spend(self, key: Key, limit: RateLimit) -> None:
+        """Count a request of a key. Raises RateLimitError if it has asked too often."""
+        now = self._clock()
+        tokens, since = self._buckets.get(key.label, (float(limit.burst), now))
+        tokens = min(float(limit.burst), tokens + (now - since) * limit.rate)
+        if tokens < 1.0:
+            self._buckets[key.label] = tokens, now
+            self.refused[key.label] += 1
+            wait_s = (1.0 - tokens) / limit.rate
+            raise RateLimitError(
+                f"the key '{key.label}' may ask {limit.rate:g} times a second here, {limit.burst} times at once: wait "
+                f"{wait_s:.3g} s",
+                {"retry_after_s": round(wait_s, 3)},
+                key=key.label,
+            )
+        self._buckets[key.label] = tokens - 1.0, now
+
 
 logger = logging.getLogger(__name__)
 

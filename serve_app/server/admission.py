@@ -1,0 +1,126 @@
+"""Admission of requests: refused are those that came too late, and those that are too much for one event loop.
+
+All requests that arrived while the loop was busy run in one turn of it, a *burst*. Its length is the queue, its
+beginning when each of them had arrived at the latest. That is known for the price of one callback per burst.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Iterator
+
+from rlservo.export.contract.errors import LateError, OverloadedError
+from rlservo.serve_app.server.settings import ServerSettings
+
+logger = logging.getLogger(__name__)
+
+TICK_S = 0.05
+SETTLE_S = 0.1  # of a loop that turns again, in which it reads what had waited
+
+
+class Admission:
+    """Refuses what came too late, or what is too much for one event loop."""
+
+    def __init__(self, settings: ServerSettings) -> None:
+        """Take the limits: of a burst, of the wait before and in it, of bodies half sent, of streams."""
+        self._max_queued = settings.max_ongoing_requests
+        self.max_wait_s = settings.max_queue_ms / 1e3
+        self._max_incoming = settings.max_incoming
+        self._max_streams = settings.max_streams
+        self.loop_clock = LoopClock(self.max_wait_s)
+        self._burst = 0
+        self._burst_began = 0.0
+        self.incoming = 0
+        self.streams = 0
+        self.longest = 0  # the longest burst so far
+
+    def check_age(self) -> None:
+        """Raise LateError for a request that may have waited too long to be read."""
+        now = time.perf_counter()
+        if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > self.max_wait_s:
+            raise LateError(
+                f"the server was blocked for more than {self.max_wait_s * 1e3:g} ms, and the observation may be as "
+                "old: send a newer one"
+            )
+
+    def enter(self) -> float:
+        """Return when this request had arrived at the latest (`time.perf_counter`).
+
+        Raises OverloadedError or LateError.
+        """
+        self.check_age()
+        now = time.perf_counter()
+        if self._burst == 0:
+            self._burst_began = now
+            asyncio.get_running_loop().call_soon(self._end_burst)
+        self._burst += 1
+        if self._burst > self._max_queued:
+            raise OverloadedError(f"more than {self._max_queued} requests are waiting in this replica: try again")
+        if now - self._burst_began > self.max_wait_s:
+            raise OverloadedError(
+                f"requests wait longer than {self.max_wait_s * 1e3:g} ms in this replica: try again shortly"
+            )
+        return self._burst_began
+
+    def _end_burst(self) -> None:
+        self.longest = max(self.longest, self._burst)
+        self._burst = 0
+
+    @contextlib.contextmanager
+    def reading_body(self) -> Iterator[None]:
+        """Count a request whose body has come in part. Raises OverloadedError."""
+        if self.incoming >= self._max_incoming:
+            raise OverloadedError(f"{self.incoming} requests are still being sent to this server: try again shortly")
+        self.incoming += 1
+        try:
+            yield
+        finally:
+            self.incoming -= 1
+
+    def open_stream(self) -> None:
+        """Count an open stream. Raises OverloadedError."""
+        if self.streams >= self._max_streams:
+            raise OverloadedError(f"{self.streams} streams are open in this replica: close one, or try again shortly")
+        self.streams += 1
+
+    def close_stream(self) -> None:
+        """Count it no longer."""
+        self.streams -= 1
+
+
+class LoopClock:
+    """Ticks in the event loop, and remembers when it did so late.
+
+    A stopped process, a long computation or a starved machine blocks the loop. What is read right after has waited for
+    an unknown time, up to all of it.
+    """
+
+    def __init__(self, limit_s: float) -> None:
+        """Take a tick that is later than `limit_s` for a loop that stood still."""
+        self._limit_s = limit_s
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self.next_tick = float("inf")
+        """When it is due, by `time.perf_counter`; the clock does not run yet."""
+        self.unknown_until = 0.0
+        """Until then it is unknown how long what is read had waited."""
+
+    def start(self) -> None:
+        """Tick in the running event loop from now on."""
+        self._loop = asyncio.get_running_loop()
+        self.next_tick = time.perf_counter()
+        self._tick()
+
+    def _tick(self) -> None:
+        now = time.perf_counter()
+        behind = now - self.next_tick
+        if behind > self._limit_s:
+            logger.warning("the event loop was blocked for %.1f s: requests that waited meanwhile are refused", behind)
+            self.unknown_until = now + SETTLE_S
+        elif now < self.unknown_until and behind > TICK_S:  # still reading
+            self.unknown_until = now + SETTLE_S
+        self.next_tick = now + TICK_S
+        assert self._loop is not None
+        self._loop.call_later(TICK_S, self._tick)
