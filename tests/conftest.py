@@ -43,9 +43,6 @@ TOGETHER = {
     "tests/system/test_serving_grpc.py": "live server",
     "tests/system/test_serving_protocols.py": "live server",
     "tests/system/test_serving_sessions.py": "live server",
-    "tests/serve_app/protocols/test_access.py::test_live": "live server",
-    "tests/serve_app/protocols/test_status_page.py::test_live": "live server",
-    "tests/serve_app/protocols/test_web_pages.py::test_live": "live server",
     "tests/system/test_robo_gym_client.py": "shipped server",
     "tests/system/test_served_policies.py": "shipped server",
     "tests/system/test_both_engines.py": "cluster",
@@ -72,7 +69,7 @@ LONGEST = (
     "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
     "tests/system/test_embedded_server.py", "sweep",
     "tests/export/rllib/test_new_stack.py", "several nodes",
-    "tests/serve_app/client/test_bad_line.py", "tests/deploy/test_compose_server.py",
+    "tests/serve_app/client/test_bad_line.py",
     "tests/system/test_remote_repository.py",
     # of `make quick`
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",

@@ -75,7 +75,7 @@ def promote(
     with needs_extra("client"):
         from rlservo.serve_app.client.admin_client import AdminClient, find_key
         from rlservo.serve_app.client.promotion import EXIT_CODES, Promotion, Terms
-        from rlservo.serve_app.client.promotion_limits import Limits
+        from rlservo.serve_app.client.promotion_evidence import Limits
         from rlservo.serve_app.client.promotion_log import PromotionLog
 
     for text, pattern, what in ((name, NAME_PATTERN, "policy name"), (version, VERSION_PATTERN, "version")):

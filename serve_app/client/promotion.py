@@ -16,8 +16,7 @@ from typing import Any
 
 from rlservo.export.contract.errors import ConflictError, RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.client.promotion_counts import Counts, Process, UntrustedError, read_metrics
-from rlservo.serve_app.client.promotion_limits import Limits, figures
+from rlservo.serve_app.client.promotion_evidence import Counts, Limits, Process, UntrustedError, figures, read_metrics
 from rlservo.serve_app.client.promotion_log import CHECK, DECISION, END, START, PromotionLog
 
 PRODUCTION = "production"

@@ -39,7 +39,8 @@ from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols import oip_infer, oip_models
 from rlservo.serve_app.protocols.http_errors import retry_after_s, status_of
 from rlservo.serve_app.protocols.oip_messages import DATA_TYPES, messages
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, as_datatype, check_form, check_size, datatype_of, from_bytes
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, check_form, check_size, datatype_of, from_bytes
+from rlservo.serve_app.runtime.input_numbers import parse_array
 from rlservo.serve_app.server.access_checks import StreamKey, authorize, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
@@ -347,7 +348,8 @@ def _typed(label: str, tensor: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
             f"input '{label}': '{field}' has {len(values)} numbers, not the {math.prod(shape)} of shape {list(shape)}",
             {"expected_shape": list(shape), "numbers": len(values)},
         )
-    return as_datatype(label, np.array(values, FIELD_DTYPES[field]), dtype).reshape(shape)
+    array = np.array(values, FIELD_DTYPES[field])
+    return parse_array(array, dtype, f"input '{label}'", ObservationError).reshape(shape)
 
 
 def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:

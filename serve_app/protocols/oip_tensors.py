@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.serve_app.protocols.json_text import json_type
-from rlservo.serve_app.runtime.input_numbers import NUMBER_KINDS, describe, find_unfit, first_non_number, to_array
+from rlservo.serve_app.runtime.input_numbers import parse_array
 
 DTYPES: dict[str, np.dtype[Any]] = {
     "BOOL": np.dtype("?"),
@@ -114,7 +114,7 @@ def from_bytes(label: str, raw: memoryview, shape: tuple[int, ...], dtype: np.dt
     Raises ObservationError for a BOOL that is neither 0 nor 1.
     """
     if dtype.kind == "b":  # numpy's own view of another byte is undefined
-        return as_datatype(label, np.frombuffer(raw, np.uint8), dtype).reshape(shape)
+        return parse_array(np.frombuffer(raw, np.uint8), dtype, f"input '{label}'", ObservationError).reshape(shape)
     array: NDArray[Any] = np.frombuffer(raw, dtype)
     if not array.flags.aligned:  # it begins wherever the JSON ended
         array = array.copy()
@@ -125,16 +125,7 @@ def _from_json(label: str, data: Any, shape: tuple[int, ...], dtype: np.dtype[An
     """Read `data`, nested or flat in row-major order."""
     if type(data) is not list:
         raise RequestError(f"input '{label}': 'data' must be a list of numbers, got {json_type(data)}")
-    try:
-        array = to_array(data)
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise ObservationError(f"input '{label}': its lists are not of equal length: {error}") from None
-    if array.size == 0:
-        array = array.astype(dtype)
-    if array.dtype.kind not in NUMBER_KINDS:
-        found = first_non_number(data, ())
-        other = describe(found[1]) if found is not None else f"values of dtype {array.dtype}"
-        raise ObservationError(f"input '{label}': 'data' holds {other}, not only numbers")
+    array = parse_array(data, dtype, f"input '{label}': 'data'", ObservationError)
     if array.shape != shape and not (array.ndim == 1 and array.size == math.prod(shape)):
         raise ObservationError(
             f"input '{label}': 'data' has the shape {list(array.shape)}, and 'shape' says {list(shape)}",
@@ -142,21 +133,12 @@ def _from_json(label: str, data: Any, shape: tuple[int, ...], dtype: np.dtype[An
         )
     if dtype.kind in "iu" and bool in _leaf_types(data):
         raise ObservationError(f"input '{label}': 'data' holds true or false, which is not an integer")
-    return as_datatype(label, array, dtype).reshape(shape)
+    return array.reshape(shape)
 
 
 def _leaf_types(data: list[Any]) -> set[type]:
     types = set(map(type, data))
     return types if list not in types else set().union(*map(_leaf_types, data))
-
-
-def as_datatype(label: str, array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return an input's numbers in its datatype. Raises ObservationError if that has no such number."""
-    unfit = find_unfit(array, dtype) if dtype.kind in "iub" else None
-    if unfit is not None:
-        raise ObservationError(f"input '{label}': {array[unfit[0]].flat[0]} is {unfit[1]}")
-    with np.errstate(over="ignore"):  # what becomes an infinity is refused with the observation, element and all
-        return array.astype(dtype)
 
 
 def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[str, Any], bytes]:

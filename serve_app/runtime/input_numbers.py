@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import RequestError, first_line
+from rlservo.export.contract.errors import RequestError, RlservoError
 from rlservo.export.contract.spaces import LeafSpec, iter_elements
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
@@ -71,20 +71,22 @@ def find_unfit(array: NDArray[Any], dtype: np.dtype[Any]) -> tuple[NDArray[np.bo
     return None
 
 
-def parse_array(given: Any, dtype: str, what: str) -> NDArray[Any]:
-    """Return a caller's numbers as an array, infinite if they are too large for it. Raises RequestError."""
+def parse_array(
+    given: Any, dtype: str | np.dtype[Any], what: str, kind: type[RlservoError] = RequestError
+) -> NDArray[Any]:
+    """Return a caller's numbers as an array, infinite if they are too large for it. Raises `kind`."""
     try:
         array = to_array(given)
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise RequestError(f"{what} cannot be read: {first_line(error)}") from error
+        raise kind(f"{what} cannot be read: its lists are not of equal length") from error
     if array.dtype.kind not in NUMBER_KINDS:
         found = first_non_number(given, ())
         value = describe(found[1]) if found is not None else f"of dtype {array.dtype}"
-        raise RequestError(f"{what} cannot be read: it holds {value}, not numbers")
+        raise kind(f"{what} cannot be read: it holds {value}, not numbers")
     target = np.dtype(dtype)
     unfit = find_unfit(array, target) if target.kind in "iub" else None
     if unfit is not None:
-        raise RequestError(f"{what} cannot be read: {array[unfit[0]].flat[0]} is {unfit[1]}")
+        raise kind(f"{what} cannot be read: {array[unfit[0]].flat[0]} is {unfit[1]}")
     with np.errstate(over="ignore"):
         return array.astype(target, copy=False)
 

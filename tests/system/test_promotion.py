@@ -22,7 +22,7 @@ import pytest
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.promotion_counts import read_metrics
+from rlservo.serve_app.client.promotion_evidence import read_metrics
 from servers import Run, free_ports, running, wait_until_served
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

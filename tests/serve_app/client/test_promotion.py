@@ -35,8 +35,7 @@ from rlservo.serve_app.client.promotion import (
     Promotion,
     Terms,
 )
-from rlservo.serve_app.client.promotion_counts import OUTCOMES
-from rlservo.serve_app.client.promotion_limits import Limits
+from rlservo.serve_app.client.promotion_evidence import OUTCOMES, Limits
 from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout

@@ -10,7 +10,6 @@ import json
 import logging
 import re
 import socket
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -498,40 +497,3 @@ def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: 
             status, answer = wire.ask(method, path, name + b": caf\xe9", *bearer(ADMIN))
             assert (status, json.loads(answer)["code"]) == (400, "bad-request") and name in answer
             assert wire.ask(method, path, name + ": café".encode(), *bearer(ADMIN), body=OBS)[0] in (200, 404, 422)
-
-
-@pytest.mark.serve
-@pytest.mark.slow
-def test_live_a_header_that_is_not_utf8_is_no_failure(live_server: Any) -> None:
-    """Serve itself decodes these, before the application sees the request (ray 2.60)."""
-    with Wire(live_server.port) as wire:
-        for name in (b"x-request-id", b"x-session-id", b"serve_multiplexed_model_id"):
-            for path in (b"/v1/policies", b"/v1/policies/ur5", b"/nowhere"):
-                status, answer = wire.ask(b"GET", path, name + b": caf\xe9", body=b"")
-                assert (status, json.loads(answer)["code"]) == (401, "unauthenticated"), (name, path, answer)
-                status, answer = wire.ask(b"GET", path, name + b": caf\xe9", *bearer(live_server.key), body=b"")
-                assert (status, json.loads(answer)["code"]) == (400, "bad-request") and name in answer, answer
-        for value in (b"inf", b"1" * 310, b"nan", b"1e999"):
-            status, answer = wire.ask(
-                b"GET", b"/v1/policies", b"x-request-timeout-seconds: " + value, *bearer(live_server.key), body=b""
-            )
-            assert status == 200, (value, answer)
-
-
-@pytest.mark.serve
-@pytest.mark.slow
-def test_live_no_spelling_reaches_administration(live_server: Any) -> None:
-    """Through HAProxy, uvicorn and Serve, of which each reads a path in its own way; the server has no admin key."""
-    with Wire(live_server.port) as wire:
-        # A path without a slash is for Serve's own proxy, which may be there a moment later than the policies.
-        until = time.monotonic() + 30
-        while wire.ask(b"GET", b"%0a/")[0] == 503:
-            assert time.monotonic() < until
-            time.sleep(0.1)
-        for path in (*(p.replace("{name}", "gridworld") for p in ADMIN_PATHS),):
-            for target in spellings(path):
-                for key in ((), bearer(live_server.key)):
-                    status, answer = wire.ask(b"GET" if path.endswith("policies") else b"POST", target, *key)
-                    assert status in (0, 400, 401, 403, 404, 405), (target, status, answer)
-        status, answer = wire.ask(b"GET", b"/v1/policies", *bearer(live_server.key))
-        assert status == 200 and b"gridworld" in answer and b'"generation":1' in answer.replace(b" ", b""), answer

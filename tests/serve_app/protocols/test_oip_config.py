@@ -164,4 +164,4 @@ def test_messages_take_every_field_of_the_documents(store: PolicyStore) -> None:
     for name in store.names:
         config = messages.ModelConfigResponse(config=_numbered(model_config(handler, name, None))).config
         assert config.input[0].data_type in (9, 11) and config.name == name  # Triton's TYPE_INT64 and TYPE_FP32
-    assert len(messages.ModelStatisticsResponse(model_stats=statistics(handler)).model_stats) == 7
+    assert len(messages.ModelStatisticsResponse(model_stats=statistics(handler)).model_stats) == 6

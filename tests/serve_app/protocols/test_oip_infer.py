@@ -262,8 +262,8 @@ def test_the_models_name_may_be_said_again(ask: Ask) -> None:
         (request(tensor([], [0, 27])), 422, "got an empty batch"),
         (request(tensor(ROW[:26], [1, 27])), 422, "'data' has the shape [26], and 'shape' says [1, 27]"),
         (request(tensor([[1, 2], [3]], [1, 27])), 422, "not of equal length"),
-        (request(tensor([*ROW[:26], "x"], [1, 27])), 422, "'data' holds the string 'x', not only numbers"),
-        (request(tensor([*ROW[:26], None], [1, 27])), 422, "'data' holds null"),
+        (request(tensor([*ROW[:26], "x"], [1, 27])), 422, "cannot be read: it holds the string 'x', not numbers"),
+        (request(tensor([*ROW[:26], None], [1, 27])), 422, "it holds null"),
         (
             b'{"inputs": [{"name": "obs", "shape": [2], "datatype": "FP32", "data": [NaN, %d]}]}' % 10**30,
             422,

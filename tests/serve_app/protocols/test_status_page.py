@@ -51,28 +51,28 @@ PICTURES = os.environ.get("RLSERVO_TEST_PICTURES")
 def test_programs_get_at_the_root_what_they_always_got(policies: Path, served: Serve) -> None:
     store = load_store(policies)
     for settings, statuses in ((ServerSettings(), (404, 404)), (ServerSettings(api_keys=ROBOT_LINE), (401, 404))):
-        with served(create_app(lambda: store, settings)) as port:
+        with served(create_app(lambda: store, settings)) as port, httpx.Client() as client:
             for accept in ("", "*/*", "application/json", "application/json, text/html;q=0.9"):
                 headers = {"accept": accept}
                 for key, status in zip(({}, {"authorization": f"Bearer {ROBOT}"}), statuses, strict=True):
-                    reply = httpx.get(f"http://127.0.0.1:{port}/", headers={**headers, **key})
+                    reply = client.get(f"http://127.0.0.1:{port}/", headers={**headers, **key})
                     assert (reply.status_code, reply.headers["content-type"]) == (status, "application/json")
                     assert reply.json()["code"] == {401: "unauthenticated", 404: "not-found"}[status]
                     assert status == 401 or reply.headers["vary"] == "Accept"
             for method in ("POST", "PUT", "DELETE"):  # the page is no target of forms
-                assert httpx.request(method, f"http://127.0.0.1:{port}/", headers=PAGE).status_code == statuses[0]
+                assert client.request(method, f"http://127.0.0.1:{port}/", headers=PAGE).status_code == statuses[0]
 
 
 def test_the_page_is_open_its_data_are_not_and_nothing_may_be_added_to_it(policies: Path, served: Serve) -> None:
     store = load_store(policies)
-    with served(create_app(lambda: store, ServerSettings(api_keys=ROBOT_LINE))) as port:
+    with served(create_app(lambda: store, ServerSettings(api_keys=ROBOT_LINE))) as port, httpx.Client() as client:
         url = f"http://127.0.0.1:{port}"
-        page = httpx.get(f"{url}/", headers=PAGE)
+        page = client.get(f"{url}/", headers=PAGE)
         assert page.status_code == 200 and page.content == (FOLDER / "index.html").read_bytes()
-        assert page.headers["vary"] == "Accept" and httpx.head(f"{url}/", headers=PAGE).status_code == 200
+        assert page.headers["vary"] == "Accept" and client.head(f"{url}/", headers=PAGE).status_code == 200
         names = re.findall(r'(?:src|href)="(page/[^"]*)"', page.text) + ["page/dom.js"]
         assert len(names) == 4
-        for reply in [page, *(httpx.get(f"{url}/{name}") for name in names)]:
+        for reply in [page, *(client.get(f"{url}/{name}") for name in names)]:
             assert reply.status_code == 200
             rules = dict(rule.split(" ", 1) for rule in reply.headers["content-security-policy"].split("; "))
             assert rules.pop("default-src") == "'none'" and rules.pop("frame-ancestors") == "'none'"
@@ -88,10 +88,10 @@ def test_the_page_is_open_its_data_are_not_and_nothing_may_be_added_to_it(polici
             assert reply.headers["cross-origin-resource-policy"] == "same-origin"
             assert "access-control-allow-origin" not in reply.headers and "set-cookie" not in reply.headers
         for path in ("page/index.html", "page/%2e%2e/status_page.py", "page/", "page", "page/x.js"):
-            assert httpx.get(f"{url}/{path}", headers=PAGE).status_code in (400, 401, 404), path
+            assert client.get(f"{url}/{path}", headers=PAGE).status_code in (400, 401, 404), path
         for path in ("v1/policies", "v1/policies/ur5", "metrics", "nowhere"):
-            assert httpx.get(f"{url}/{path}", headers=PAGE).status_code == 401, path
-        rebound = httpx.get(f"{url}/", headers={**PAGE, "host": "evil.example"})
+            assert client.get(f"{url}/{path}", headers=PAGE).status_code == 401, path
+        rebound = client.get(f"{url}/", headers={**PAGE, "host": "evil.example"})
         assert (rebound.status_code, rebound.json()["code"]) == (403, "forbidden")
 
 
@@ -476,24 +476,3 @@ def test_a_foreign_page_gets_nothing_of_it(tab: Tab, server: Served, served: Ser
         assert found == {"frame": "null"}
         frames = tab.call("Page.getFrameTree")["frameTree"]["childFrames"]
         assert [frame["frame"]["url"] for frame in frames] == ["chrome-error://chromewebdata/"], frames
-
-
-@pytest.mark.serve
-@pytest.mark.slow
-def test_live_the_page_shows_what_runs(tab: Tab, live_server: Any) -> None:
-    """On the embedded server, with a key; one worker has no name to show."""
-    url = f"http://127.0.0.1:{live_server.port}"
-    tab.visit(url)
-    tab.wait_for_text("This server wants an API key.")
-    tab.type(live_server.key)
-    tab.press("Enter")
-    tab.wait_for_text("5 policies served", "Versions of ur5")
-    before = int(tab.evaluate(row("10"))["Requests"].replace(",", ""))
-    for _ in range(5):
-        headers = {"authorization": live_server.bearer}
-        reply = httpx.post(f"{url}/v1/policies/ur5/act", json={"obs": [0.1] * 27}, headers=headers, timeout=20)
-        assert reply.status_code == 200
-    tab.wait_for(f"Number({row('10')}.Requests.replaceAll(',', '')) >= {before + 5}")
-    assert httpx.get(url, timeout=20).status_code == 401
-    tab.evaluate("document.querySelector('#policy-act_nested').parentElement.querySelector('tbody button').click()")
-    tab.wait_for_text("Contract of act_nested, version 1", "Memory, carried from step to step", "obs.", "action.")

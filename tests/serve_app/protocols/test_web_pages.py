@@ -204,34 +204,3 @@ def test_a_page_whose_name_leads_to_the_server_moves_and_reads_nothing(browser: 
     answers = {outcome for name, outcome in report.items() if not name.endswith(("form", "beacon"))}
     assert answers == {403, 400, "refused"}, report
     check_untouched(target, report, plan)
-
-
-@pytest.mark.serve
-@pytest.mark.slow
-def test_live_a_page_is_refused_for_where_it_comes_from(browser: Browser, live_server: Any, served: Serve) -> None:
-    """Through HAProxy, ahead of Serve's handling and behind it; before anybody looks at a key."""
-    pages = Pages(nothing, page_for(f"http://127.0.0.1:{live_server.port}"))
-    with served(pages) as port:
-        report = visit(browser, f"http://localhost:{port}/page.html", pages)
-    assert {report[name] for name in report if name.startswith("socket")} == {"refused"}, report
-    assert not [name for name, outcome in report.items() if name.startswith("read") and outcome == 200], report
-    url, key = f"http://127.0.0.1:{live_server.port}", {"authorization": live_server.bearer}
-    metrics = httpx.get(f"{url}/metrics", headers=key, timeout=20).text
-    for protocol in ("http", "websocket"):
-        assert f'rlservo_requests_total{{code="forbidden",policy="",protocol="{protocol}"' in metrics
-    act = {"obs": [0.1] * 27}
-    assert httpx.post(f"{url}/v1/policies/ur5/act", json=act, headers=key, timeout=20).status_code == 200
-    for path, document in (("/v1/policies/ur5/act", act), ("/v2/repository/index", {}), ("/nowhere", {})):
-        for foreign in (
-            {"host": "evil.example"},
-            {"host": f"evil.example:{live_server.port}", "origin": f"http://evil.example:{live_server.port}"},
-            {"origin": "http://127.0.0.1:1"},
-            {"origin": "null"},
-            {"sec-fetch-site": "cross-site"},
-            {"sec-fetch-site": "same-site"},
-        ):
-            reply = httpx.post(f"{url}{path}", json=document, headers={**key, **foreign}, timeout=20)
-            assert (reply.status_code, reply.json()["code"]) == (403, "forbidden"), (path, foreign, reply.text)
-    for host in ("evil.example", "127.0.0.1.evil.example", "localhost.evil.example", "10.0.0.7", "127.0.0.1@evil"):
-        reply = httpx.get(f"{url}/v1/policies", headers={**key, "host": host}, timeout=20)
-        assert reply.status_code in (400, 403), (host, reply.text)  # HAProxy itself refuses what is no host

@@ -114,7 +114,7 @@ def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: PolicyApp) ->
             asyncio.run(handler.answer(OipGrpcCodec(handler), request, (message.SerializeToString(), None)))
 
 
-IMAGE = BoxSpec(shape=(84, 84, 4), dtype="uint8", low=0, high=255)
+IMAGE = BoxSpec(shape=(20, 20, 4), dtype="uint8", low=0, high=255)
 NAMED = BoxSpec(
     shape=(3,), dtype="float32", low=None, high=None, elements=tuple(Element(name=f"a,[{i}]:{{") for i in range(3))
 )

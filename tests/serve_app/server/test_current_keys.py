@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server import api_key_file
+from rlservo.serve_app.server import current_keys
 from rlservo.serve_app.server.access_checks import find_key
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.current_keys import CurrentKeys
@@ -211,9 +211,9 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
         go_on.wait(30)
         return OLD_LINE.encode()
 
-    monkeypatch.setattr(api_key_file, "STALE_S", 0.1)
+    monkeypatch.setattr(current_keys, "STALE_S", 0.1)
     app = create_app(lambda: store, ServerSettings(api_keys_file=str(file)))
-    monkeypatch.setattr(api_key_file, "read_key_file", hang)
+    monkeypatch.setattr(current_keys, "read_key_file", hang)
     try:
         with served(app) as port:
             assert hanging.wait(10)
@@ -222,7 +222,7 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
             assert b'rlservo_api_keys_current{replica=""} 0.0' in asyncio.run(exposition(app.handler))
     finally:
         go_on.set()
-    monkeypatch.setattr(api_key_file, "STALE_S", 10.0)
+    monkeypatch.setattr(current_keys, "STALE_S", 10.0)
     wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in asyncio.run(exposition(app.handler)))
 
 

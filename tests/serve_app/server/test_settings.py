@@ -12,7 +12,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 def test_arguments_win_over_the_environment_over_the_defaults() -> None:
     environment = {"RLSERVO_THREADS": "3", "RLSERVO_MAX_BATCH": "7", "RLSERVO_SOMETHING_ELSE": "x"}
     settings = ServerSettings.from_environment({"threads": 2}, environment=environment)
-    assert (settings.threads, settings.max_batch, settings.docs) == (2, 7, True)
+    assert (settings.threads, settings.max_batch, settings.max_streams) == (2, 7, 256)
 
 
 @pytest.mark.parametrize(

@@ -7,18 +7,21 @@ from typing import Any
 import pytest
 
 from rlservo.export.contract.errors import UnavailableError
-from rlservo.serve_app.client.promotion_counts import (
+from rlservo.serve_app.client.promotion_evidence import (
     ANSWERS,
     DIFFERENCES,
     ENDS,
     MISSED,
     OUTCOMES,
     Counts,
+    Figure,
+    Limits,
     Process,
     UntrustedError,
+    figures,
+    interval,
     read_metrics,
 )
-from rlservo.serve_app.client.promotion_limits import Figure, Limits, figures, interval
 
 
 def figure(total: dict[str, float], **limit: Any) -> Figure:
@@ -40,7 +43,7 @@ def ends(version: str, won: float, lost: float) -> dict[str, float]:
 
 
 def test_interval_is_that_of_the_paper(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rlservo.serve_app.client.promotion_limits.Z", 1.959964)
+    monkeypatch.setattr("rlservo.serve_app.client.promotion_evidence.Z", 1.959964)
     assert interval(0, 10) == (pytest.approx(0.0), pytest.approx(0.2775, abs=1e-4))
     assert interval(81, 263) == (pytest.approx(0.2553, abs=1e-4), pytest.approx(0.3662, abs=1e-4))
 
