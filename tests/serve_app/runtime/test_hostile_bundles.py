@@ -73,7 +73,7 @@ def root(policies: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def patience(request: pytest.FixtureRequest) -> dict[str, float]:
     """Time that the server waits for the file system."""
-    return {"load_timeout_s": 60.0, **getattr(request, "param", {})}
+    return {"timeout_s": 60.0, **getattr(request, "param", {})}
 
 
 @pytest.fixture
@@ -359,8 +359,8 @@ def test_while_a_file_system_does_not_answer_all_else_goes_on(
 
 @pytest.mark.parametrize(
     ("name", "patience", "sentence"),
-    [("contract.json", {"load_timeout_s": 0.5}, "looking through the policies' folders took longer than 0.5 s and was"),
-     ("policy.onnx", {"load_timeout_s": 0.5}, "loading policy 'ur5' version 10 took longer")],
+    [("contract.json", {"timeout_s": 0.5}, "looking through the policies' folders took longer than 0.5 s and was"),
+     ("policy.onnx", {"timeout_s": 0.5}, "loading policy 'ur5' version 10 took longer")],
     indirect=["patience"],
 )  # fmt: skip
 def test_a_file_system_that_hangs_is_given_up_with_a_few_threads_at_most(
