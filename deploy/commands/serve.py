@@ -72,6 +72,10 @@ def serve(
     record: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Record every decision into this folder (`rlservo log`).")
     ] = None,
+    poll: Annotated[
+        float | None,
+        typer.Option(min=1, metavar="SECONDS", help="Look for new versions this often; they are loaded but not used."),
+    ] = None,
     session_store: Annotated[
         str | None,
         typer.Option(
@@ -117,6 +121,7 @@ def serve(
             for name, value in (
                 ("default_policy", default_policy),
                 ("record", record and str(record)),
+                ("poll_s", poll),
                 ("session_store", session_store),
             )
             if value is not None

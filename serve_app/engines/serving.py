@@ -56,6 +56,8 @@ class Serving:
         self._tasks.append(asyncio.create_task(self.control.poll_plan()))
         if self.handler.metrics.is_shared:
             self._tasks.append(asyncio.create_task(keep_sampled(self.handler)))
+        if self.settings.poll_s is not None:
+            self._tasks.append(asyncio.create_task(self.control.poll_repository(self.settings.poll_s)))
         # What is loaded by now stays: a collection that walks it would hold requests up.
         gc.collect()
         gc.freeze()

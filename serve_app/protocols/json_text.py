@@ -42,7 +42,7 @@ def json_type(value: Any) -> str:
     return names.get(type(value)) or f"the number {value!r:.40}"
 
 
-def encode_json(document: Mapping[str, Any]) -> bytes:
+def encode_json(document: Mapping[str, Any] | list[Any]) -> bytes:
     """Return any small document's JSON; text that UTF-8 cannot hold is escaped rather than refused."""
     try:
         return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)

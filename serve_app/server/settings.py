@@ -154,6 +154,10 @@ class ServerSettings(BaseModel):
     cache_bytes: int = Field(10 << 30, ge=1 << 20)
     """Largest size of the cache: the least recently used versions are removed, those in use never."""
 
+    poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
+    """[s] Look through the places of policies this often, and load versions that are newer than those known, as
+    `rlservo policy load` does: ready, not in use. Off by default. Also set by `rlservo serve --poll`."""
+
     @property
     def bundle_limits(self) -> BundleLimits:
         """Size limits of a bundle's files."""

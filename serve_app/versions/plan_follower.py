@@ -13,6 +13,7 @@ import logging
 import time
 from collections.abc import Awaitable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from rlservo.export.contract.contract import version_key
@@ -29,6 +30,7 @@ from rlservo.serve_app.versions.version_loader import Loadable, VersionLoader
 logger = logging.getLogger(__name__)
 
 RETRY_PERIOD_S = 30.0  # [s] between attempts at a version that could not be loaded
+REFUSED_PERIOD_S = 300.0  # [s] between attempts at a new version that was refused, when no command asked for it
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,7 @@ class PlanFollower:
         self._failed: dict[Loadable, RlservoError] = {}  # why this process serves something older than the plan
         self._refused: dict[Key, str] = {}  # by the last command that this process took
         self._tried_at = 0.0
+        self._config = ServedConfig()  # which versions may be loaded without being asked for
 
     @property
     def place(self) -> str:
@@ -70,10 +73,10 @@ class PlanFollower:
 
         Raises UsageError, BundleError and UnavailableError.
         """
-        config = ServedConfig.parse(document)
+        self._config = ServedConfig.parse(document)
         held: list[Policy] = []
-        plan = await self._writer.at_start(config, held)
-        if document and not plan_changes.agrees(plan, config):
+        plan = await self._writer.at_start(self._config, held)
+        if document and not plan_changes.agrees(plan, self._config):
             logger.warning(
                 "plan %d in %s (%s) differs from the configuration and is used: `rlservo policy` changes it",
                 plan.generation,
@@ -126,36 +129,77 @@ class PlanFollower:
     async def poll_plan(self) -> None:
         """Follow the plans that others write, until cancelled."""
         telling = asyncio.create_task(self._tell_newer())  # where files hang, the plan is followed all the same
-        told = ""
         try:
-            while True:
-                await asyncio.sleep(self._files.poll_s)
-                try:
-                    await self.follow()
-                    told = ""
-                except Exception as error:  # it may be out of reach for a while; what is served continues
-                    if str(error) != told:
-                        logger.warning("the plan cannot be followed, serving continues unchanged: %s", error)
-                    told = str(error)
+            await self._follow_always()
         finally:
             telling.cancel()
 
     async def _tell_newer(self) -> None:
-        """Log which versions of the served policies came into the repository after those that the plan knows."""
         with contextlib.suppress(UnavailableError):
             digests, _ = await self._loader.look()
-            number, policies = self._generation(), {} if self.plan is None else self.plan.policies
-            newer = [
-                f"{name} {version}"
-                for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1])))
-                if (known := policies.get(name)) is not None
-                and all(version_key(version) > version_key(each) for each in (*known.versions, *known.unloaded))
-            ]
+            newer = ", ".join(" ".join(key) for key in self._newer(digests)[:10])
             if newer:
-                listed = ", ".join(newer[:10])
+                number = self._generation()
                 logger.warning(
-                    "newer than the versions of plan %d, and not loaded: %s (`rlservo policy load`)", number, listed
+                    "newer than the versions of plan %d, and not loaded: %s (`rlservo policy load`)", number, newer
                 )
+
+    async def _follow_always(self) -> None:
+        told = ""
+        while True:
+            await asyncio.sleep(self._files.poll_s)
+            try:
+                await self.follow()
+                told = ""
+            except Exception as error:  # it may be out of reach for a while; what is served continues
+                if str(error) != told:
+                    logger.warning("the plan cannot be followed, serving continues unchanged: %s", error)
+                told = str(error)
+
+    async def poll_repository(self, period_s: float) -> None:
+        """Load what is newer than all versions that the plan knows of a policy, as `load` does, until cancelled.
+
+        What the configuration leaves out is also left out here; what an operator unloads stays unloaded.
+        """
+        refused_until: dict[Loadable, float] = {}
+        told: set[str] = set()
+        while True:
+            await asyncio.sleep(period_s)
+            try:
+                digests, errors = await self._loader.look()
+                wrong = {error.message for error in errors}
+                for name, version in self._newer(digests):
+                    key = (name, version, digests[name, version])
+                    if time.monotonic() < refused_until.get(key, 0.0):
+                        continue
+                    try:
+                        add = partial(plan_changes.load, name=name, version=version, digest=key[2])
+                        await self.change(add, what=f"poll {name} {version}")
+                    except UnavailableError as error:
+                        wrong.add(error.message)
+                    except RlservoError as error:
+                        wrong.add(error.message)
+                        refused_until[key] = time.monotonic() + REFUSED_PERIOD_S
+            except Exception as error:
+                wrong = {str(error)}
+            for sentence in sorted(wrong - told):
+                logger.warning("looking for new versions failed, serving continues unchanged: %s", sentence)
+            told = wrong
+
+    def _newer(self, digests: Mapping[Key, str]) -> list[Key]:
+        """Return the versions that a policy's known ones are all older than; of an unknown policy only the newest."""
+        policies = {} if self.plan is None else self.plan.policies
+        newer: list[Key] = []
+        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
+            listed, known = self._config.policies.get(name), policies.get(name)
+            if self._config.unlisted == "ignore" if listed is None else listed.versions is not None:
+                continue
+            if known is None and newer and newer[-1][0] == name:
+                newer.pop()
+            before = () if known is None else (*known.versions, *known.unloaded)
+            if all(version_key(version) > version_key(each) for each in before):
+                newer.append((name, version))
+        return newer
 
     def states(self) -> dict[str, dict[str, VersionState]]:
         """Return how every version stands that is served, should be, or was refused."""

@@ -755,6 +755,95 @@ def test_an_environments_proxy_is_asked_but_not_for_this_machine(monkeypatch: py
     assert asked == [("http://policies.example/index.json", "Basic cm9ib3Q6cGFzcyB3b3Jk"), ("/own.json", None)]
 
 
+def test_polling_loads_what_is_newer_and_says_once_that_the_storage_is_away(
+    made: Path, storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(made, storage.uri, "2")
+
+    async def run() -> None:
+        control = replica(storage.uri, cache=cache)
+        await control.configure({})
+        poll = asyncio.create_task(control.poll_repository(0.05))
+        await asyncio.to_thread(put, made, storage.uri, "1", "3")
+        await until(lambda: control.store is not None and control.store.versions("ur5") == ("2", "3"))  # 1 is not newer
+        assert control.store is not None and control.store.default("ur5") == "2"
+        await control.change(lambda plan: plan_changes.unload(plan, "ur5", "3"), what="unload")
+        looks = storage.gets(INDEX)
+        await until(lambda: storage.gets(INDEX) > looks + 4)
+        assert control.store.versions("ur5") == ("2",)  # what an operator unloaded stays unloaded
+        storage.go_away()
+        await until(lambda: "looking for new versions failed, serving continues unchanged: s3://" in caplog.text)
+        storage.tell(None)
+        await asyncio.to_thread(put, made, storage.uri, "4")
+        await until(lambda: control.store is not None and control.store.versions("ur5") == ("2", "4"))
+        poll.cancel()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(run())
+    told = [line for line in caplog.messages if line.startswith("looking for new versions")]
+    assert len(told) == len(set(told))
+
+
+@pytest.mark.parametrize(
+    ("lie", "sentence"),
+    [
+        (only("2/policy.onnx", late(4)), "took longer than 1 s and was given up"),
+        (only("2/policy.onnx", busy), "policy.onnx cannot be reached or"),
+        (only(INDEX, echo), "index.json is refused"),
+        (only("000000002.json", busy), "000000002.json cannot be reached or"),
+    ],
+    ids=["version late", "version away", "index away", "plan away"],
+)
+def test_polling_tries_again_what_could_not_be_read_for_a_while(
+    lie: Lie, sentence: str, made: Path, storage: Storage, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(made, storage.uri, "1")
+
+    async def run() -> None:
+        control = replica(storage.uri, cache=cache, timeout_s=2)
+        await control.configure({})
+        await asyncio.to_thread(put, made, storage.uri, "2")
+        storage.tell(lie)
+        poll = asyncio.create_task(control.poll_repository(0.05))
+        await until(lambda: sentence in caplog.text)
+        assert control.store is not None and control.store.versions("ur5") == ("1",)
+        storage.tell(None)
+        await until(lambda: control.store is not None and control.store.versions("ur5") == ("1", "2"))
+        poll.cancel()
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(run())
+
+
+def test_polling_leaves_out_what_the_configuration_pins(made: Path, cache: Path, tmp_path: Path) -> None:
+    place = tmp_path / "p"
+    for version in ("1", "2"):
+        write_box_policy(place, version=version)
+        write_box_policy(place, name="mir", version=version)
+
+    async def served(document: Any) -> dict[str, tuple[str, ...]]:
+        files = PlanFiles([place], root=str(tmp_path / json.dumps(document).replace("/", "")))
+        control = PlanFollower(VersionLoader(Repository([place])), files)
+        await control.configure(document)
+        write_box_policy(place, version="3")
+        write_box_policy(place, name="new", version="1")
+        write_box_policy(place, name="new", version="2")
+        poll = asyncio.create_task(control.poll_repository(0.02))
+        await asyncio.sleep(1.0)
+        poll.cancel()
+        assert control.store is not None
+        found = {name: control.store.versions(name) for name in control.store.names}
+        shutil.rmtree(place / "ur5" / "3")
+        shutil.rmtree(place / "new")
+        return found
+
+    pinned = {"policies": {"ur5": {"versions": ["1"]}}, "unlisted": "ignore"}
+    assert asyncio.run(served(pinned)) == {"ur5": ("1",)}
+    everything = {"ur5": ("1",), "mir": ("1", "2"), "new": ("2",)}
+    assert asyncio.run(served({**pinned, "unlisted": "load"})) == everything
+    assert asyncio.run(served({})) == {**everything, "ur5": ("1", "2", "3")}
+
+
 def test_a_wait_is_said(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rlservo.serve_app.versions.blocking_calls.SILENCE_S", 0.05)
     go_on = threading.Event()
