@@ -1,7 +1,8 @@
-"""MkDocs hooks: the order of the navigation, and every public name on its page."""
+"""MkDocs hooks: the order of the navigation, the page of the HTTP API, and every public name on its page."""
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,25 @@ from mkdocs.exceptions import PluginError
 from mkdocs.plugins import event_priority
 
 import rlservo
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.protocols.docs_page import files_of_swagger_ui
+from rlservo.serve_app.protocols.openapi import openapi
+from rlservo.serve_app.server.settings import ServerSettings
 
 SECTIONS = {"tutorial": "Tutorial", "how-to": "How-to", "reference": "Reference", "explanation": "Explanation"}
 PYTHON_PAGE = "reference/python.md"
 NOT_OBJECTS = {"__version__", "errors"}  # errors has a page of its own
+OPENAPI_PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>rlservo API</title>
+<meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">
+<link rel="stylesheet" href="swagger/swagger-ui.css"></head>
+<body><div id="swagger-ui"></div><script src="swagger/swagger-ui-bundle.js"></script><script>
+SwaggerUIBundle({spec: %s, dom_id: "#swagger-ui", validatorUrl: null, supportedSubmitMethods: [],
+  presets: [SwaggerUIBundle.presets.apis], layout: "BaseLayout"});
+</script></body></html>
+"""
+
+
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("envs", "export", "serve_app", "deploy")
 PACKAGE = tempfile.TemporaryDirectory(prefix="rlservo-site-")  # removed with the process
@@ -43,3 +59,13 @@ def on_files(files: Any, config: Any) -> Any:
     if missing:
         raise PluginError(f"{PYTHON_PAGE} does not document {', '.join(missing)}")
     return files
+
+
+def on_post_build(config: Any) -> None:
+    """Write the page of the HTTP API, with the document inside: a page from disk may fetch nothing."""
+    site = Path(config.site_dir)
+    (site / "swagger").mkdir(exist_ok=True)
+    for name in ("swagger-ui.css", "swagger-ui-bundle.js"):
+        shutil.copy(files_of_swagger_ui() / name, site / "swagger" / name)
+    text = openapi(create_app(lambda: None, ServerSettings()).table).decode().replace("</", "<\\/")
+    (site / "openapi.html").write_text(OPENAPI_PAGE % text, encoding="utf-8")

@@ -108,7 +108,7 @@ def serve(
             terminal.show(f"{served.grpc}  gRPC, Open Inference Protocol")
         if served.admin_key_file is not None:
             note(f"administration: rlservo policy --help; its key is in {served.admin_key_file}")
-        terminal.show(f"ready; status page: {served.url}; Ctrl-C stops")
+        terminal.show(f"ready; status page: {served.url} (API: {served.url}/docs); Ctrl-C stops")
 
     serve_policies(
         directories,

@@ -10,7 +10,7 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.protocols.oip_grpc import METHODS, Grpc
-from rlservo.serve_app.protocols.oip_messages import SERVICE
+from rlservo.serve_app.protocols.oip_messages import SERVICE, messages
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.wire.addresses import is_loopback
 
@@ -44,6 +44,8 @@ class GrpcServer:
         service: Any = health  # its asyncio part is not in its type stubs
         self._health = service.aio.HealthServicer()  # what orchestrators probe, without a key
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        if settings.grpc_reflection:
+            _add_reflection(self._server)
 
     async def start(self) -> None:
         """Listen, and report to be serving. Raises UnavailableError if the port cannot be listened on."""
@@ -72,3 +74,11 @@ class GrpcServer:
     async def _stream(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[bytes]:
         async for reply in self._grpc.stream(requests, context):
             yield reply.SerializeToString()
+
+
+def _add_reflection(server: Any) -> None:
+    """Let grpcurl and others ask which methods and messages the protocol has."""
+    from grpc_reflection.v1alpha import reflection
+
+    pool = messages.ModelInferRequest.DESCRIPTOR.file.pool
+    reflection.enable_server_reflection((SERVICE, reflection.SERVICE_NAME), server, pool=pool)

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from rlservo.serve_app.protocols import admin_routes, json_codec, oip_infer, oip_models, status_page, websocket_stream
+from rlservo.serve_app.protocols import (
+    admin_routes,
+    docs_page,
+    json_codec,
+    oip_infer,
+    oip_models,
+    status_page,
+    websocket_stream,
+)
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.http_errors import Headers
 from rlservo.serve_app.protocols.routes import GET, Call, Route, RoutingTable
@@ -42,8 +50,10 @@ def create_app(
         *oip_infer.routes(handler),
         *oip_models.routes(handler),
         *status_page.routes(),
+        *docs_page.routes(lambda: table),
     ]
-    return PolicyApp(handler, checks, RoutingTable(routes), is_behind_serve=is_behind_serve)
+    table = RoutingTable(routes)
+    return PolicyApp(handler, checks, table, is_behind_serve=is_behind_serve)
 
 
 def _health(handler: RequestHandler) -> list[Route]:

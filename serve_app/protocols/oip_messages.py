@@ -138,6 +138,10 @@ UNARY = (
     "RepositoryIndex",
 )
 STREAM = "ModelStreamInfer"
+_METHODS = {name: f"{name}Request {name}Response" for name in UNARY}
+_METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
 
-messages: Any = SimpleNamespace(**build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice"))
+messages: Any = SimpleNamespace(
+    **build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice", services={"GRPCInferenceService": _METHODS})
+)
 """The classes by name; those made at run time have no static type. A nested one is an attribute of its outer one's."""

@@ -45,6 +45,8 @@ class Route:
     """In place of `answer`: of actions and streams, a callable that reads what it wants itself."""
     is_page: bool = False
     """For browsers, which ask for HTML and not for JSON; for others there is no such route."""
+    is_documented: bool = True
+    """Whether it is in the OpenAPI document."""
 
 
 def of_policy(

@@ -58,9 +58,14 @@ def routes() -> list[Route]:
 
         return answer
 
-    page = Route(GET, "/", Access.open, "Status page", reply(INDEX, (b"vary", b"Accept")), is_page=True)
+    page = Route(
+        GET, "/", Access.open, "Status page", reply(INDEX, (b"vary", b"Accept")), is_page=True, is_documented=False
+    )
     others = sorted(files.keys() - {INDEX})
     return [
         page,
-        *(Route(GET, f"/page/{name}", Access.open, "File of the status page", reply(name)) for name in others),
+        *(
+            Route(GET, f"/page/{name}", Access.open, "File of the status page", reply(name), is_documented=False)
+            for name in others
+        ),
     ]

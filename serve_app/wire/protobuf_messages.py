@@ -20,13 +20,15 @@ def build_messages(
     messages: Mapping[str, Sequence[str]],
     *,
     oneof: str = "choice",
+    services: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, Any]:
     """Return the classes of a proto3 package by name.
 
     `messages` gives each one's fields in the order of their numbers, or with a number of their own: `int64 ns`,
     `repeated float action`, `map float limits` (from string), `bool ready = 17`. A type is one of protobuf's own or a
     message. A nested message is written Outer.Inner, after its outer one. `oneof` fields share the one oneof of their
-    message, which gets the name `oneof`.
+    message, which gets the name `oneof`. `services` gives each service's methods, for reflection alone:
+    `InferRequest InferResponse`, `stream InferRequest stream InferResponse`.
     """
     file = descriptor_pb2.FileDescriptorProto(name=f"rlservo/{package}.proto", package=package, syntax="proto3")
     made: dict[str, Any] = {}
@@ -39,6 +41,17 @@ def build_messages(
             if field.startswith("oneof ") and not message.oneof_decl:
                 message.oneof_decl.add(name=oneof)
             _add_field(message, package, name, int(number or position), field)
+    for service, methods in (services or {}).items():
+        described = file.service.add(name=service)
+        for method, types in methods.items():
+            given, made_of = types.replace("stream ", "stream_").split(" ")
+            described.method.add(
+                name=method,
+                input_type=f".{package}.{given.removeprefix('stream_')}",
+                output_type=f".{package}.{made_of.removeprefix('stream_')}",
+                client_streaming=given.startswith("stream_"),
+                server_streaming=made_of.startswith("stream_"),
+            )
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
     # Classes made at run time have no static type: Any is all a type checker can be told.

@@ -12,9 +12,11 @@ import os
 import random
 import socket
 import struct
+import subprocess
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -30,6 +32,8 @@ pytestmark = [pytest.mark.serve, pytest.mark.slow]
 TIMES = float(os.environ.get("RLSERVO_FUZZ", "1"))
 SEED = int(os.environ.get("RLSERVO_FUZZ_SEED", "7"))
 SLOWEST_S = 15.0  # [s] on a machine that does other things as well; a hang is longer
+SCHEMATHESIS = ("schemathesis==4.32.5",)
+CHECKS = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
 NUMBERS: list[Any] = [0, -0.0, 1e308, -1, 2**63, 2**64, 1e-320, 10**40, True, None, "1", "NaN", [], {}]
 PATHS = [
     "..%2f..%2fetc%2fpasswd/act",
@@ -272,3 +276,24 @@ def test_no_page_of_another_origin_is_let_in(live_server: Any) -> None:
         assert not [name for name in reply.headers if name.lower().startswith("access-control")], (method, path)
         assert method != "OPTIONS" or reply.status == 405
     connection.close()
+
+
+def test_what_the_openapi_document_promises_holds(
+    live_server: Any, client_environment: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Schemathesis sends what the document allows and what it does not, and reads what comes back against it."""
+    schemathesis = client_environment(*SCHEMATHESIS).parent / "schemathesis"
+    done = subprocess.run(
+        [
+            str(schemathesis), "run", f"http://127.0.0.1:{live_server.port}/openapi.json",
+            "--header", f"Authorization: {live_server.bearer}",
+            "--seed", str(SEED), "--max-examples", str(int(5 * TIMES) or 1), "--request-timeout", str(SLOWEST_S),
+            "--phases", "examples,coverage,fuzzing", "--no-color",
+            "--checks", CHECKS,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=400,
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]

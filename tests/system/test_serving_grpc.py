@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import socket
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
-from servers import free_ports
+from servers import free_ports, launched
 from stores import load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -287,11 +288,18 @@ def test_messages_leave_the_process_wide_pool_alone() -> None:
     assert done.stdout.strip() == "free", done.stderr
 
 
-def test_health_is_told_without_a_key(live_server: Any) -> None:
+def test_health_is_told_without_a_key_and_reflection_where_it_is_wanted(policies: Path) -> None:
     from grpc_health.v1 import health_pb2, health_pb2_grpc
+    from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-    with grpc.insecure_channel(f"127.0.0.1:{live_server.grpc_port}") as channel:
-        for service in ("", "inference.GRPCInferenceService"):
-            request = health_pb2.HealthCheckRequest(service=service)
-            reply = health_pb2_grpc.HealthStub(channel).Check(request, timeout=20)
-            assert reply.status == health_pb2.HealthCheckResponse.SERVING
+    with launched(policies, with_grpc=True, settings={"grpc_reflection": True}) as run:
+        run.wait_until_ready()
+        with grpc.insecure_channel(f"127.0.0.1:{run.grpc_port}") as channel:
+            for service in ("", "inference.GRPCInferenceService"):
+                request = health_pb2.HealthCheckRequest(service=service)
+                reply = health_pb2_grpc.HealthStub(channel).Check(request, timeout=20)
+                assert reply.status == health_pb2.HealthCheckResponse.SERVING
+            ask = reflection_pb2.ServerReflectionRequest(file_containing_symbol="inference.GRPCInferenceService")
+            (found,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([ask]))
+            assert b"ModelStreamInfer" in found.file_descriptor_response.file_descriptor_proto[0]
+        assert run.end(signal.SIGTERM) == 0

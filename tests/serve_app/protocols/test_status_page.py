@@ -453,7 +453,7 @@ window.finished = Promise.all([
   note("page", fetch(target + "/", {headers: {accept: "text/html"}}).then(reply => reply.text())),
   note("opaque", fetch(target + "/", {headers: {accept: "text/html"}, mode: "no-cors"}).then(reply => reply.type)),
   note("script", load("script", "/page/status.js")), note("icon", load("img", "/page/icon.svg")),
-  note("frame", frame("/")),
+  note("frame", frame("/")), note("docs", frame("/docs")),
 ]).then(() => out);
 </script>"""
 
@@ -473,6 +473,6 @@ def test_a_foreign_page_gets_nothing_of_it(tab: Tab, server: Served, served: Ser
         tab.wait_for("window.finished")
         found = tab.evaluate("window.finished")
         assert [found.pop(name) for name in ("page", "opaque", "script", "icon")] == ["TypeError"] * 2 + ["refused"] * 2
-        assert found == {"frame": "null"}
+        assert found == {"frame": "null", "docs": "null"}
         frames = tab.call("Page.getFrameTree")["frameTree"]["childFrames"]
-        assert [frame["frame"]["url"] for frame in frames] == ["chrome-error://chromewebdata/"], frames
+        assert [frame["frame"]["url"] for frame in frames] == ["chrome-error://chromewebdata/"] * 2, frames
