@@ -92,7 +92,7 @@ def _set_state(component: Any, folder: Path) -> None:
 
 
 def _with_time_axis(connectors: list[Any]) -> list[Any]:
-    """Return a pipeline's connectors, with a separate one for part of older `AddStatesFromEpisodesToBatch` (to Ray 2.40)."""
+    """Return a pipeline's connectors; part of `AddStatesFromEpisodesToBatch` (up to Ray 2.40) is a separate one."""
     names = [kind.__name__ for kind, *_ in connectors]
     if STATES not in names or TIME_AXIS in names:
         return connectors

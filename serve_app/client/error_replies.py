@@ -49,7 +49,7 @@ def excerpt(content: bytes) -> str:
 
 
 def _classes() -> dict[str, type[RlservoError]]:
-    """Return every error class by its code, as the wire names it."""
+    """Return every error class by its code."""
     classes: dict[str, type[RlservoError]] = {}
     queue: list[type[RlservoError]] = [RlservoError]
     while queue:

@@ -1,4 +1,4 @@
-"""Counts of a promotion: by how much the servers' metrics of a policy have grown since it began.
+"""Counts of a promotion: growth of the servers' metrics of a policy since it began.
 
 A process counts from its own start. Its increments between two checks are summed; one that disappears
 keeps what it had, and one that is new counts from its first look. Counters never fall: metrics that do are not trusted.
@@ -88,10 +88,10 @@ class Counts:
 
     total: Numbers = field(default_factory=dict)
     seen: dict[str, Numbers] = field(default_factory=dict)
-    """Each process' own numbers when it was last seen."""
+    """Each process's numbers at its last reading."""
 
     def add(self, processes: Mapping[str, Process]) -> None:
-        """Add what was counted since the last look. Raises UntrustedError."""
+        """Add the counts since the last reading. Raises UntrustedError."""
         for name, process in processes.items():
             now = process.numbers
             before = self.seen.get(name, now)

@@ -1,4 +1,4 @@
-"""Limits of a promotion: the share of requests, actions or episodes that may speak against a version.
+"""Limits of a promotion: the share of requests, actions or episodes that may count against a version.
 
 Each is such a share: of failed requests, of requests slower than a p99 (1%), of actions further apart (1%), of episodes
 without success (production's share and the drop). While a version is watched it is rolled back when the share is surely
@@ -50,7 +50,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Figure:
-    """Cases that speak against a version, of all of their kind."""
+    """Cases that count against a version, of all of their kind."""
 
     what: str
     against: float

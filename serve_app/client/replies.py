@@ -1,4 +1,4 @@
-"""Replies checked: they answer this request, and their step, state and action fit the policy's contract."""
+"""Checks of replies: they answer this request, and their step, state and action fit the policy's contract."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rlservo.serve_app.wire.request_names import MARK
 
 
 def answering_version(url: str, reply: Any, number: int, contract: Contract) -> str:
-    """Return which version answered; refuse an answer to another request or from another policy."""
+    """Return the version that answered; refuse an answer to another request or from another policy."""
     if not isinstance(reply, dict):
         raise UnavailableError(f"{url} answered with {type(reply).__name__}, expected an object")
     if reply.get("seq") != number:
@@ -94,7 +94,7 @@ def decode_action(action: Any, batch: tuple[int, ...], contract: Contract) -> An
 
 
 def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
-    """Whether this is an action of the policy for so many observations."""
+    """Whether this is an action of the policy for this number of observations."""
     try:
         decode_action(action, batch, contract)
     except ActionError:

@@ -1,4 +1,4 @@
-"""Address of a policy server, as a client is given it."""
+"""Address of a policy server."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rlservo.export.contract.errors import UsageError
 
 
 def parse_address(url: str, schemes: Mapping[str, str]) -> str:
-    """Return `url` under the scheme that `schemes` has for its own, without a slash at its end. Raises UsageError."""
+    """Return `url` with its scheme mapped by `schemes`, without a trailing slash. Raises UsageError."""
     parts = urlsplit(url)
     try:
         has_host = bool(parts.hostname) and parts.port != 0
@@ -24,5 +24,5 @@ def parse_address(url: str, schemes: Mapping[str, str]) -> str:
 
 
 def host_of(parts: SplitResult) -> bytes:
-    """Return a host as the wire has it."""
+    """Return a host in its encoded form."""
     return (parts.hostname or "").encode("idna")

@@ -42,11 +42,11 @@ PROOF_S = 10.0
 """[s] Time limit for the golden vectors: a network computes thousands in a second, but a graph can have loops."""
 
 Run = Callable[..., Any]
-"""onnxruntime's: output names, inputs by name and, if need be, its options, to arrays."""
+"""onnxruntime's `run`: output names, inputs by name and, if need be, its options, to arrays."""
 
 
 def check_contract(bundle: Bundle) -> None:
-    """Refuse what this runtime cannot run faithfully, and contracts that contradict themselves."""
+    """Refuse bundles that this runtime cannot run faithfully, and contracts that contradict themselves."""
     contract = bundle.contract
     observations = leaf_specs(contract.observation_space, "obs")
     actions = leaf_specs(contract.action_space, "action")
@@ -180,7 +180,7 @@ def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> Non
 
 
 def acting_outputs(contract: Contract) -> list[str]:
-    """Return the graph's outputs but for `value`."""
+    """Return the graph's outputs except `value`."""
     return [tensor.name for tensor in contract.outputs if tensor.name != VALUE]
 
 
@@ -230,7 +230,7 @@ def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str,
 
 
 def check_rows(bundle: Bundle, run: Run) -> None:
-    """Refuse to compute observations together if that is something else than one by one. Raises BundleError."""
+    """Refuse to compute observations together if the result differs from one by one. Raises BundleError."""
     inputs, _ = bundle.golden()
     names = acting_outputs(bundle.contract)
     rows = {tensor.name: np.resize(inputs[tensor.name], (3, *inputs[tensor.name].shape[1:]))
@@ -288,7 +288,7 @@ def _ties(
     rtol: float,
     atol: float,
 ) -> NDArray[np.bool_]:
-    """Return where another discrete choice is as good: its score ties with the recorded one's within tolerance."""
+    """Return a mask of the rows in which another discrete choice ties with the recorded one within tolerance."""
     expected = recorded[name]
     none = np.zeros(expected.shape, np.bool_)
     scores = next((recorded[key] for key in ("action_dist_inputs", "q_values") if key in recorded), None)
