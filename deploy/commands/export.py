@@ -17,7 +17,10 @@ from rlservo.export.contract.extras import needs_extra
 
 def export(
     checkpoint: Annotated[
-        str, typer.Argument(help="Checkpoint file or folder (of a Tune trial the newest), or a URI such as s3://...")
+        str,
+        typer.Argument(
+            help="Checkpoint file or folder, a Tune trial (its newest checkpoint), or a URI such as s3://..."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
     name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,

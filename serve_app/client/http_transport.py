@@ -261,7 +261,7 @@ def _connection_pool(url: str, backend: DeadlineBackend, proxy: str | None) -> h
     address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
     if parts.scheme not in PROXIES:
         raise UsageError(
-            f"a proxy in the environment variables begins with {parts.scheme!r}: expected for example 'http://proxy:3128'"
+            f"a proxy in the environment variables begins with {parts.scheme!r}: expected an address such as 'http://proxy:3128'"
         )
     return PROXIES[parts.scheme](address, user, **options)
 

@@ -17,7 +17,7 @@ def parse_address(url: str, schemes: Mapping[str, str]) -> str:
     except ValueError:
         has_host = False
     if parts.scheme not in schemes or not has_host:
-        raise UsageError(f"{url!r} is not a server address: expected for example 'http://127.0.0.1:8000'")
+        raise UsageError(f"{url!r} is not a server address: expected an address such as 'http://127.0.0.1:8000'")
     if parts.query or parts.fragment:
         raise UsageError(f"{url!r} has a query or fragment: expected only scheme, host, port and path")
     return parts._replace(scheme=schemes[parts.scheme]).geturl().rstrip("/")

@@ -132,8 +132,8 @@ def estimate(
         report.estimates += importance_sampling(trajectories, gamma, rng)
     elif explore:
         raise UsageError(
-            "an exploring policy's return can be estimated only from recorded actions that explored, with their "
-            f"log-probabilities, and {contract.name}'s did not all: leave --explore out, or record with it"
+            "an exploring policy's return can be estimated only if every recorded action explored and has its "
+            "log-probability, which {contract.name}'s do not: leave --explore out, or record with it"
         )
     if not explore:
         progress(f"fitting the value of actions to {len(trajectories)} episodes")
