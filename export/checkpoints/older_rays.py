@@ -94,8 +94,8 @@ def _statistics(saved: Mapping[str, Any]) -> Mapping[str, Any]:
         return saved
     if "std_array" not in saved:
         raise UnsupportedError(
-            f"the observation filter's statistics are in an unknown form: expected 'sum_sq_diff_array' (of "
-            f"an older Ray 'std_array') among {', '.join(saved)}"
+            "the observation filter's statistics are in an unknown form: expected 'sum_sq_diff_array' ('std_array' in "
+            f"an older Ray) among {', '.join(saved)}"
         )
     mean, squares = saved["mean_array"], saved["std_array"]
     # A delta is what a filter has seen since it was merged with others': nothing, so these are not used.

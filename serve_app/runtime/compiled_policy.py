@@ -61,7 +61,7 @@ class CompiledPolicy(Policy):
                 raise BundleTamperedError(f"{each} is not the file that was proven: {COMPILE_FILE} has another hash")
         library = CompiledLibrary(file, about["prefix"], contract)
         if library.bundle != about["bundle"]:
-            raise BundleTamperedError(f"{file} was compiled from another bundle than {COMPILE_FILE} says")
+            raise BundleTamperedError(f"{file} was compiled from another bundle than the one in {COMPILE_FILE}")
         bundle = Bundle(folder, contract, recorded, about["bundle"])
         super().__init__(bundle, cast(Any, library), options, graph_hash=recorded[file.name])
 
