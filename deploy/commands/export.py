@@ -142,7 +142,7 @@ def prune(
     module_id: Annotated[str | None, typer.Option(help="RLModule to keep; required if there are several.")] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
 ) -> None:
-    """Copy only what export needs out of a checkpoint. The copy is small enough to commit or to mail.
+    """Copy only the parts of a checkpoint that export needs. The copy is small enough to commit or to mail.
 
     Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
     """
