@@ -133,7 +133,7 @@ def estimate(
     elif explore:
         raise UsageError(
             "an exploring policy's return can be estimated only if every recorded action explored and has its "
-            "log-probability, which {contract.name}'s do not: leave --explore out, or record with it"
+            f"log-probability, which {contract.name}'s do not: leave --explore out, or record with it"
         )
     if not explore:
         progress(f"fitting the value of actions to {len(trajectories)} episodes")
