@@ -1,1 +1,1 @@
-"""Exporter: an RLlib checkpoint becomes a policy bundle, proven equal to RLlib's own actions."""
+"""Exporter: turns a checkpoint into a policy bundle, proven equal to the trainer's own actions."""

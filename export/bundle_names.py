@@ -43,7 +43,7 @@ def check_names(name: str | None, version: str | None) -> None:
 def choose_target(out: Path, name: str, version: str | None) -> Path:
     """Return the folder to write, which does not exist yet; the version defaults to the next integer.
 
-    Raises UsageError when that version is there already, or something is in the way.
+    Raises UsageError when that version exists already, or something is in the way.
     """
     policy = out / name
     if (out.exists() and not out.is_dir()) or (policy.exists() and not policy.is_dir()):

@@ -58,7 +58,7 @@ def read_elements(
 
 
 def _env_class(env_id: str) -> Any:
-    """Return the class behind a Gymnasium id, with or without its module, or a `module:Class` path; make nothing."""
+    """Return the class of a Gymnasium id, with or without its module, or of a `module:Class` path."""
     module, _, name = importing_id(env_id).rpartition(":")
     if module:
         importlib.import_module(module)

@@ -172,7 +172,7 @@ def export_all_modules(
 def export_files(
     policies: Sequence[PolicyFiles], options: ExportOptions, checkpoint: str | Path, *, name_all: bool = False
 ) -> list[ExportResult]:
-    """Write a bundle for each of `policies`; they get their names when all of them are proven."""
+    """Write a bundle for each of `policies`; they are named once all are proven."""
     check_names(options.name, options.version)
     root, source = policies[0].root, options.source
     require(source.extra, *source.packages, *TORCH, what=f"exporting from {source.framework}")
@@ -228,7 +228,7 @@ def _build(
     options: ExportOptions,
     folders: contextlib.ExitStack,
 ) -> tuple[Path, ExportResult]:
-    """Return the finished bundle in a folder that only wants its name."""
+    """Return the finished bundle in a folder that is not named yet."""
     source = options.source
     options.progress(f"restoring '{files.module_id}' (importing torch and {source.framework} takes seconds)")
     restored = source.restore(files, options.restore, options.notify)
@@ -426,7 +426,7 @@ def _provenance(files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPo
 
 
 def _write_rest(folder: Path, contract: Contract, golden_inputs: Inputs, golden_outputs: Outputs) -> None:
-    """Write golden vectors, contract and hashes, and check that the finished files are what was proven."""
+    """Write golden vectors, contract and hashes, and check that the finished files are those that were proven."""
     from rlservo.export.graph.onnx_file import add_metadata, run_onnx
 
     add_metadata(folder / ONNX_FILE, {CONTRACT_KEY: contract_json(contract)})

@@ -1,4 +1,4 @@
-"""`rlservo.export_policy`: a torch module in memory to a proven bundle."""
+"""`rlservo.export_policy`: turns a torch module in memory into a proven bundle."""
 
 from __future__ import annotations
 

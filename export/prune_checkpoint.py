@@ -1,4 +1,4 @@
-"""`rlservo prune`: copy out of a checkpoint only what an export needs, without anybody's paths.
+"""`rlservo prune`: copy out of a checkpoint only what an export needs, without the user's paths.
 
 RLlib's own configuration pickles hold the training script's location and more, so they stay behind; what they say of
 algorithm, environment and progress goes into one JSON file.

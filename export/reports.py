@@ -1,4 +1,4 @@
-"""`rlservo inspect`: a contract as tables a roboticist can read."""
+"""`rlservo inspect`: a contract as tables."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def peak_memory_mb() -> float:
 
 
 def verification_report(parity: Parity, evaluation: Evaluation | None) -> RenderableType:
-    """Return what `rlservo verify` found: the parity and, where episodes were run, both sides of the closed loop."""
+    """Return the result of `rlservo verify`: the parity and, if episodes were run, both sides of the closed loop."""
     parts: list[RenderableType] = [_proof(parity)]
     if evaluation is not None:
         parts.append(_evaluation_table([evaluation]))
@@ -131,7 +131,7 @@ def _space_tables(title: str, root: str, space: SpaceSpec, frozen: BakedStep | N
 def _table(
     title: str, *columns: str, right: Sequence[str] = (), fold: Sequence[str] = ()
 ) -> tuple[Table, RenderableType]:
-    """Return (a table, what to print): the title stands above it, whose width it would be broken to otherwise."""
+    """Return (a table, renderable): the title is above it, or it would be wrapped to the table's width."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for column in columns:
         justify: JustifyMethod = "right" if column in right else "left"
@@ -155,7 +155,7 @@ def _count(size: int) -> str:
 
 
 def _span(bound: NDArray[np.float64]) -> str:
-    """Return one bound where all elements share it, else its range."""
+    """Return one bound if all elements share it, else its range."""
     least, most = float(bound.min()), float(bound.max())
     return _number(least) if least == most else f"{_number(least)} .. {_number(most)}"
 
@@ -199,7 +199,7 @@ def _shown(size: int) -> list[int | None]:
 
 
 def _filter(contract: Contract) -> BakedStep | None:
-    """Return the filter if it has seen the observation itself, and not what another step makes of it."""
+    """Return the filter if it applies to the observation itself, not to another step's output."""
     before = itertools.takewhile(lambda step: step.step not in CHANGING, contract.baked_in)
     return next((step for step in before if step.step == "mean_std_filter"), None)
 

@@ -14,7 +14,7 @@ from rlservo.export.contract.extras import needs_extra
 
 def compile(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
-    out: Annotated[Path, typer.Option(help="Folder for the C; an earlier one of the same policy is replaced.")],
+    out: Annotated[Path, typer.Option(help="Folder for the C files; an earlier one of the same policy is replaced.")],
     cc: Annotated[
         str | None, typer.Option(help="C compiler for the proof; $CC or the machine's own by default.")
     ] = None,

@@ -17,7 +17,10 @@ from rlservo.export.contract.extras import needs_extra
 
 def export(
     checkpoint: Annotated[
-        str, typer.Argument(help="Checkpoint file or folder (of a Tune trial the newest), or a URI such as s3://...")
+        str,
+        typer.Argument(
+            help="Checkpoint file or folder, a Tune trial (its newest checkpoint), or a URI such as s3://..."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
     name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
@@ -139,7 +142,7 @@ def prune(
     module_id: Annotated[str | None, typer.Option(help="RLModule to keep; required if there are several.")] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
 ) -> None:
-    """Copy only what export needs out of a checkpoint. The copy is small enough to commit or to mail.
+    """Copy only the parts of a checkpoint that export needs. The copy is small enough to commit or to mail.
 
     Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
     """

@@ -45,7 +45,7 @@ def learn(
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     key_file: KeyFile = None,
 ) -> None:
-    """Train a served policy on what robots do with it.
+    """Train a served policy from the robots that use it.
 
     Robots ask the server for `policy` under the alias and explore; the server records them. Their whole episodes train
     PPO from the checkpoint on. Every few updates the result is exported, proven and published, the server loads it and

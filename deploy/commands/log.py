@@ -35,7 +35,7 @@ class Format(str, Enum):
 
 @log.command()
 def info(files: Files, as_json: Json = False) -> None:
-    """Show what recordings contain, and what is missing.
+    """Show the content of recordings, and what is missing.
 
     Example: `rlservo log info recordings`
     """

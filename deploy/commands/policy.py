@@ -102,7 +102,7 @@ def unload(
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Unload an unused version, or a whole policy. No alias, canary or shadow may lead to the version.
+    """Unload an unused version, or a whole policy. No alias, canary or shadow may point to the version.
 
     Example: `rlservo policy unload ur5 3`
     """
@@ -120,7 +120,7 @@ def alias(
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Point an alias to a loaded version. Clients that ask for no version get `production`.
+    """Point an alias to a loaded version. Clients that name no version get `production`.
 
     Example: `rlservo policy alias ur5 production=4`
     """

@@ -30,7 +30,8 @@ def promote(
         str, typer.Option("--for", metavar="TIME", help="How long to watch the canary: 90s, 10m, 2h.")
     ] = "10m",
     max_error_rate: Annotated[
-        str | None, typer.Option(metavar="SHARE", help="Share of its requests that may fail by its own fault: 0.1%.")
+        str | None,
+        typer.Option(metavar="SHARE", help="Share of its requests that may fail through its own fault: 0.1%."),
     ] = None,
     max_p99: Annotated[
         str | None, typer.Option(metavar="TIME", help="Latency in the server that 1% of its answers may exceed: 20ms.")

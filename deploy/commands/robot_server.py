@@ -220,7 +220,7 @@ def ur_controller(
         str, typer.Option(help="ur3e, ur5e, ur10e or ur16e (500 Hz); ur3, ur5 or ur10 (125 Hz).")
     ] = "ur5e",
     host: Annotated[
-        str, typer.Option(help="Address to listen on: ports 29999 and 30001 to 30004, which clients do not choose.")
+        str, typer.Option(help="Address to listen on; the ports are always 29999 and 30001 to 30004.")
     ] = "127.0.0.1",
     latency_ms: Annotated[float, typer.Option(min=0.0, help="Delay of the link, each way.")] = 0.0,
     jitter_ms: Annotated[float, typer.Option(min=0.0, help="Largest additional delay (jitter).")] = 0.0,

@@ -190,7 +190,7 @@ def split_pair(text: str, example: str, separator: str = "=") -> tuple[str, str]
     """Return the words before and after the separator. Raises UsageError, with the example."""
     key, found, value = text.partition(separator)
     if not key or not found:
-        raise UsageError(f"{text!r}: expected for example {example}")
+        raise UsageError(f"{text!r}: expected something like {example}")
     return key, value
 
 

@@ -56,7 +56,7 @@ def verify(
     compiled: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of `rlservo compile`: drive --env with it as well; the same seeds must end the same."
+            help="Folder of `rlservo compile`: drive --env with it as well; equal seeds must end the same way."
         ),
     ] = None,
     write: Annotated[

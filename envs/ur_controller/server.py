@@ -115,7 +115,7 @@ class ControllerServer:
     # -- traffic
 
     def _pass_traffic(self, timeout_s: float) -> None:
-        """Wait for sockets at most so long, and deliver what the link has held back long enough."""
+        """Wait for sockets at most this long, and deliver data whose delay on the link is over."""
         readers = [] if self.link.is_down else [*self._listeners, *self._connections]
         ready, _, _ = select.select(readers, [], [], timeout_s)
         for each in ready:

@@ -1,4 +1,4 @@
-"""Pick one checkpoint out of a Tune experiment by a metric, from the result.json files that Tune writes.
+"""Choice of a checkpoint of a Tune experiment by a metric, from the result.json files that Tune writes.
 
 A metric is written as Tune prints it, `env_runners/episode_return_mean`. RLlib's results do not say which checkpoint
 was saved with them; the training iteration in the checkpoint's own state does, which is a pickle.
@@ -68,7 +68,7 @@ def best_checkpoint(
 
 
 def _reported(trial: Path, notify: Callable[[str], None]) -> Iterator[tuple[Path, Mapping[str, Any]]]:
-    """Yield each checkpoint of a trial that is still there, and the result that was reported with it."""
+    """Yield each checkpoint of a trial that still exists, and the result reported with it."""
     try:
         lines = (trial / RESULTS).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -104,7 +104,7 @@ def _open(file: Path, what: str, notify: Callable[[str], None]) -> dict[str, Any
 
 
 def read_config(ctor_args_and_kwargs: Any) -> Mapping[str, Any]:
-    """Return the algorithm's configuration as a mapping, wherever RLlib put it among the constructor's arguments."""
+    """Return the algorithm's configuration as a mapping, from its place among the constructor's arguments."""
     if not isinstance(ctor_args_and_kwargs, tuple) or len(ctor_args_and_kwargs) != 2:
         return {}
     args, kwargs = ctor_args_and_kwargs
@@ -118,7 +118,7 @@ def _as_mapping(config: Any) -> Mapping[str, Any]:
 
 
 def _env_name(env: Any) -> str | None:
-    """Return the id the environment was made by; for a class given directly, its import path."""
+    """Return the environment's id; for a class given directly, its import path."""
     if isinstance(env, str):
         return plain_id(env)
     if isinstance(env, type):

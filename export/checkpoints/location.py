@@ -1,6 +1,6 @@
-"""Find the files of a checkpoint: from whatever folder a person points at to the folders the exporter reads.
+"""Location of a checkpoint's files: from the path a user gives to the folders the exporter reads.
 
-File names are enough for it, so that a wrong path is reported before RLlib is imported or code in a checkpoint runs.
+File names are enough, so that a wrong path is reported before RLlib is imported or code in a checkpoint runs.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class CheckpointFiles:
         return self.runner / MODULE_TO_ENV
 
     def files(self) -> list[Path]:
-        """Return every file that decides what the policy does, in a fixed order."""
+        """Return every file that affects the policy, in a fixed order."""
         folders = (self.module, self.env_to_module, self.module_to_env)
         found = {file for folder in folders for file in folder.rglob("*") if file.is_file()}
         early = weights_pickle(self.module).name == OLD_WEIGHTS
@@ -164,7 +164,7 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: 
 
 
 def is_known(path: Path, stack: type[Files]) -> bool:
-    """Return whether `path` is of RLlib, and of this API stack; one that only an older Ray could read is of the new."""
+    """Return whether `path` is RLlib's, of this API stack; one that only an older Ray could read counts as the new."""
     if not path.is_dir():
         return False
     try:
@@ -180,7 +180,7 @@ def is_known(path: Path, stack: type[Files]) -> bool:
 def locate_modules(path: str | Path) -> list[Files]:
     """Return the files of every policy of a checkpoint, by module id (old API stack: policy id).
 
-    Raises what `locate_checkpoint` raises.
+    Raises the errors of `locate_checkpoint`.
     """
     given = Path(path).expanduser().absolute()
     root = _find_root(given) if given.is_dir() else given
@@ -189,7 +189,7 @@ def locate_modules(path: str | Path) -> list[Files]:
 
 
 def _find_root(given: Path) -> Path:
-    """Return the algorithm checkpoint that `given` is, lies in, or holds."""
+    """Return the algorithm checkpoint that `given` is, is in, or holds."""
     for folder in (given, *given.parents):
         if (folder / MODULES).is_dir():
             return folder

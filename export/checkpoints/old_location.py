@@ -1,4 +1,4 @@
-"""Find the files of an old-API-stack checkpoint: `policies/<policy id>/policy_state.pkl`, or such a folder on its own.
+"""Location of an old-API-stack checkpoint's files: `policies/<policy id>/policy_state.pkl`, or such a folder alone.
 
 As in `location.py`, names of files are enough.
 """
@@ -33,11 +33,11 @@ class OldStackFiles:
     root: Path
     """The algorithm checkpoint, or the policy's own folder if there is nothing else."""
     module_id: str
-    """The policy's id, under the name the rest of the exporter has for it."""
+    """The policy's id, under the exporter's name for it."""
 
     @property
     def agent_id(self) -> None:
-        """No agent is ever named: a policy filters alike for all of its own."""
+        """Always None: all agents of a policy share one filter."""
 
     @property
     def is_one_of_several(self) -> bool:
@@ -54,7 +54,7 @@ class OldStackFiles:
         return self.policy / POLICY_STATE
 
     def files(self) -> list[Path]:
-        """Return every file that decides what the policy does."""
+        """Return every file that affects the policy."""
         return [self.state]
 
     def sha256(self) -> str:

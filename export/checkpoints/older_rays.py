@@ -1,4 +1,4 @@
-"""Pickles of older Rays and of other Pythons, read as what the Ray that restores them (2.60) would have written.
+"""Pickles of older Rays and other Pythons, converted to those of the Ray that restores them (2.60).
 
 Names that have moved, values whose class is gone, filters' statistics. The new API stack's own differences, which take
 RLlib to translate, are in `rllib/older_components.py`.
@@ -34,13 +34,13 @@ MOVED = {
 
 
 class Gone:
-    """Stands for a value whose class, one of Ray's or gym's, is not there any more; it holds the value's attributes."""
+    """Stand-in for a value whose class, one of Ray's or gym's, no longer exists; it holds the value's attributes."""
 
     def __init__(self, *_args: Any, **_kwargs: Any) -> None:
-        """Take whatever the class took."""
+        """Accept any arguments."""
 
     def __setstate__(self, state: Any) -> None:
-        """Take whatever the class took."""
+        """Accept any arguments."""
         if isinstance(state, dict):
             self.__dict__.update(state)
 
@@ -48,7 +48,7 @@ class Gone:
 def find_class(find: Callable[[str, str], Any], module: str, name: str, *, missing_ok: bool) -> Any:
     """Return the object that a pickle names; `find` looks it up at its present place.
 
-    With `missing_ok` a `Gone` stands for what Ray and gym no longer have. Raises ImportError or AttributeError.
+    With `missing_ok` a `Gone` replaces classes that Ray and gym no longer have. Raises ImportError or AttributeError.
     """
     if module.endswith("cloudpickle.cloudpickle") and name == "_builtin_type":
         return _builtin_type
@@ -64,12 +64,12 @@ def find_class(find: Callable[[str, str], Any], module: str, name: str, *, missi
 
 
 def _builtin_type(name: str) -> Any:
-    """Return what cloudpickle makes functions from that it has pickled by value."""
+    """Return cloudpickle's constructor of functions that it pickled by value."""
     return _code if name == "CodeType" else getattr(types, name)
 
 
 def _code(*parts: Any) -> types.CodeType:
-    """Return a function's code, or one that raises where another Python's was pickled: few of them are ever called."""
+    """Return a function's code, or code that raises if another Python's was pickled: few of them are ever called."""
     try:
         return types.CodeType(*parts)
     except (TypeError, ValueError):
@@ -94,8 +94,8 @@ def _statistics(saved: Mapping[str, Any]) -> Mapping[str, Any]:
         return saved
     if "std_array" not in saved:
         raise UnsupportedError(
-            f"the observation filter's statistics are in an unknown form: expected 'sum_sq_diff_array' (of "
-            f"an older Ray 'std_array') among {', '.join(saved)}"
+            "the observation filter's statistics are in an unknown form: expected 'sum_sq_diff_array' ('std_array' in "
+            f"an older Ray) among {', '.join(saved)}"
         )
     mean, squares = saved["mean_array"], saved["std_array"]
     # A delta is what a filter has seen since it was merged with others': nothing, so these are not used.

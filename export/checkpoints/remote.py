@@ -1,4 +1,4 @@
-"""Download a checkpoint from any URI that Ray itself reads into a temporary folder, removed afterwards.
+"""Download of a checkpoint from any URI that Ray itself reads, into a temporary folder that is removed afterwards.
 
 Like Ray's own storage it asks pyarrow first (`file://`, `s3://`, `gs://`, `hdfs://`) and then fsspec (`memory://`,
 `abfs://`, `http://`, ... if the package of that protocol is installed).
@@ -22,15 +22,15 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")  # two letters and more: C:/
 
 
 def is_uri(path: str | Path) -> bool:
-    """Return whether `path` names a place by a protocol."""
+    """Return whether `path` is a URI with a protocol."""
     return isinstance(path, str) and _SCHEME.match(path) is not None
 
 
 @contextlib.contextmanager
 def fetch(path: str | Path, progress: Callable[[str], None]) -> Iterator[Path]:
-    """Give the local folder of `path`: itself, or a copy of what its URI names, removed on the way out.
+    """Give the local folder of `path`: itself, or a copy of its URI's files, removed at the end.
 
-    Raises CheckpointError when there is nothing there, UsageError when no file system here reads such URIs. Errors from
+    Raises CheckpointError when nothing is there, UsageError when no file system here reads such URIs. Errors from
     inside name the URI, not the copy.
     """
     if not is_uri(path):

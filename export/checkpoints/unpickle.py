@@ -1,4 +1,4 @@
-"""Load a checkpoint's pickles, and explain in one sentence why one cannot be loaded.
+"""Loading of a checkpoint's pickles, with a one-sentence reason if one cannot be loaded.
 
 Loading a pickle runs the code it names; callers warn first.
 """
@@ -66,7 +66,7 @@ def _load(stream: BinaryIO, name: str, *, missing_ok: bool) -> Any:
 
 
 def unpickle_plain(file: Path) -> Any:
-    """Return the numbers, texts and containers pickled in `file`; whatever takes code to load is a stand-in.
+    """Return the numbers, texts and containers pickled in `file`; anything that needs code is a stand-in.
 
     For a configuration that names modules which are not there. Raises CheckpointError when the file is damaged.
     """
@@ -88,7 +88,7 @@ class _PlainUnpickler(pickle.Unpickler):
 
 
 class _StandIn:
-    """Takes whatever a pickle does to an object, and forgets it."""
+    """Accepts and ignores everything that a pickle does to an object."""
 
     def __new__(cls, *_args: Any, **_kwargs: Any) -> _StandIn:
         return object.__new__(cls)
@@ -108,7 +108,7 @@ class _StandIn:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Reads older Rays' pickles as today's."""
+    """Reads older Rays' pickles as current ones."""
 
     def __init__(self, stream: BinaryIO, *, missing_ok: bool) -> None:
         super().__init__(stream)
@@ -136,7 +136,7 @@ def explain(error: BaseException) -> str:
 
 
 def searched() -> str:
-    """Return the import path as a person reads it: without the standard library, which holds no user code."""
+    """Return the import path for a message: without the standard library."""
     hidden = ("lib/python", "__editable__", ".zip")
     own = [entry or "." for entry in sys.path if not any(part in entry for part in hidden)]
     return ", ".join(dict.fromkeys([*own, "the installed packages"]))

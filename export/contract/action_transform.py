@@ -18,7 +18,7 @@ Transform: TypeAlias = Literal["none", "unsquash", "clip"]
 
 
 def transform_of(contract: Contract) -> Transform:
-    """Return what is done to the policy's own actions; choices are counted from the space's start in any case."""
+    """Return the transform of the policy's own actions; choices are always counted from the space's start."""
     if contract.distribution is not None:
         return contract.distribution.transform
     steps = {step.step for step in contract.baked_in}  # a module that computes its actions itself has no distribution
@@ -33,7 +33,7 @@ def is_invertible(contract: Contract) -> bool:
 
 
 def to_sent(own: NDArray[Any], transform: Transform, leaf: LeafSpec) -> NDArray[Any]:
-    """Return the actions that are sent for own ones, both `[rows, *leaf.shape]`, of float64 for a Box."""
+    """Return the sent actions for own ones, both `[rows, *leaf.shape]`, of float64 for a Box."""
     if not isinstance(leaf, BoxSpec):
         return own + _start(leaf)
     effect = _effect(transform, leaf)
@@ -72,7 +72,7 @@ def to_own(sent: NDArray[Any], transform: Transform, leaf: LeafSpec) -> tuple[ND
 
 
 def _effect(transform: Transform, leaf: BoxSpec) -> Literal["none", "unsquash", "clip", "shift"]:
-    """Return what becomes of one Box: unsquashed only if bounded on all sides, and as an integer only moved."""
+    """Return the transform of one Box: unsquashed only if bounded on all sides, and an integer is only shifted."""
     low, high = leaf.bounds()
     if transform == "unsquash":
         if not (np.isfinite(low).all() and np.isfinite(high).all()):

@@ -1,4 +1,4 @@
-"""Policy bundle: the one contract between the exporter and everything that runs a policy.
+"""Policy bundle: the interface between the exporter and everything that runs a policy.
 
 A bundle is a folder `<name>/<version>/` holding
 
@@ -60,7 +60,7 @@ class BundleLimits:
     """Limit of each file except the two below; None for no limit."""
 
     max_golden_bytes: int = 512 << 20
-    """Of golden.npz, packed and unpacked."""
+    """Limit of golden.npz, packed and unpacked."""
 
     max_contract_bytes: int = 16 << 20
 
@@ -161,7 +161,7 @@ def load_bundle(path: str | Path, limits: BundleLimits = DEFAULT_LIMITS) -> Bund
 
 
 def resolve_bundle(path: str | Path) -> Path:
-    """Return the one bundle folder that `path` means: itself, its newest version, or its only policy's newest."""
+    """Return the bundle folder of `path`: itself, its newest version, or its only policy's newest."""
     newest: dict[Path, Path] = {}
     for folder in find_bundles(path):  # versions of one policy come in ascending order
         newest[folder.parent] = folder
@@ -240,7 +240,7 @@ def read_sums(folder: Path) -> tuple[str, dict[str, str]]:
 
 
 def _verified(file: Path, recorded: str, limits: BundleLimits) -> Iterator[bytes]:
-    """Yield a file's content; after the last of it raise BundleTamperedError where its hash is not the recorded one."""
+    """Yield a file's content; then raise BundleTamperedError if its hash is not the recorded one."""
     actual = hashlib.sha256()
     for block in _blocks(file, *limits.of(file.name)):
         actual.update(block)
@@ -254,7 +254,7 @@ def _verified(file: Path, recorded: str, limits: BundleLimits) -> Iterator[bytes
 
 
 def _blocks(file: Path, max_bytes: int | None, limit: str = "") -> Iterator[bytes]:
-    """Yield a file's content; `limit` is what `max_bytes` is called. Raises BundleError."""
+    """Yield a file's content; `limit` is the name of `max_bytes`. Raises BundleError."""
     try:
         with open_regular(file, max_bytes) as stream:
             yield from blocks(stream, max_bytes)
@@ -269,7 +269,7 @@ def _blocks(file: Path, max_bytes: int | None, limit: str = "") -> Iterator[byte
 
 
 def _check_unpacked(file: Path, content: io.BytesIO, max_bytes: int) -> None:
-    """Refuse an archive whose arrays are larger than they may be, or than what is packed of them."""
+    """Refuse an archive whose arrays exceed the limit or their packed content."""
     with zipfile.ZipFile(content) as archive:
         size = sum(member.file_size for member in archive.infolist())
         if size > max_bytes:
@@ -286,7 +286,7 @@ def _check_unpacked(file: Path, content: io.BytesIO, max_bytes: int) -> None:
 
 @contextmanager
 def _private_file() -> Iterator[tuple[IO[bytes], Path]]:
-    """Give an empty file for this process alone, and the path under which this process can open it."""
+    """Give an empty private file, and the path under which this process can open it."""
     if DESCRIPTORS.is_dir():
         with tempfile.TemporaryFile() as unnamed:
             yield unnamed, DESCRIPTORS / str(unnamed.fileno())

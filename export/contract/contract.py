@@ -17,7 +17,7 @@ REWARD = "reward"  # the graph's input for what the last action brought, of a po
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
 Tolerance: TypeAlias = Annotated[float, Field(ge=0.0, le=1e-2)]
-"""A larger difference is not rounding, whatever a contract says."""
+"""A larger difference is never rounding."""
 
 
 class TensorSpec(FrozenModel):
@@ -73,7 +73,7 @@ class BakedStep(FrozenModel):
     """One processing step inside the graph, in the order it is applied."""
 
     step: str = Field(description="For example 'mean_std_filter', 'one_hot', 'network', 'mode', 'unsquash', 'clip'")
-    detail: str = Field("", description="A sentence for readers")
+    detail: str = Field("", description="Explanation in a sentence")
     values: dict[str, Any] = Field(default_factory=dict, description="For example count, mean and std of a filter")
 
 
@@ -163,7 +163,7 @@ def version_key(version: str) -> tuple[int, ...]:
 
 
 def first_fault(error: ValidationError) -> str:
-    """Return the first thing that is wrong with a document: `field: message`."""
+    """Return the first error in a document: `field: message`."""
     first = error.errors(include_url=False)[0]
     return f"{'.'.join(str(part) for part in first['loc']) or 'the document'}: {first['msg']}"
 

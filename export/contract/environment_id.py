@@ -7,10 +7,10 @@ MODULE = "rlservo.envs:"
 
 
 def importing_id(env_id: str) -> str:
-    """Return the id as `gym.make` takes it where nothing has imported our environments; others' as they are."""
+    """Return the id as `gym.make` takes it without importing our environments first; others' unchanged."""
     return f"{MODULE}{env_id}" if env_id.startswith(f"{NAMESPACE}/") else env_id
 
 
 def plain_id(env_id: str) -> str:
-    """Return the id as contracts and reports name it: ours without its module."""
+    """Return the id for contracts and reports: ours without its module."""
     return env_id.removeprefix(MODULE)

@@ -1,4 +1,4 @@
-"""Tree of the errors that a user of rlservo can meet.
+"""Error classes of rlservo.
 
 One table in `serve_app/protocols/http_errors.py` maps these to status codes, and one handler in `deploy/cli.py` maps
 them to exit codes.
@@ -122,7 +122,7 @@ class RequestError(RlservoError):
 
 
 class StateNeededError(RequestError):
-    """The policy remembers its episode, and the request carries nothing of it.
+    """The policy has memory, and the request carries none of it.
 
     A client may not know that before: a limit on the step of its actions is set on the server. For clients it is a
     `bad-request` with these details.
@@ -169,7 +169,7 @@ class DeadlineError(RlservoError):
 
 
 class SessionError(RlservoError):
-    """The request does not fit where its session stands."""
+    """The request does not fit its session's state."""
 
     code = "session-conflict"
 
@@ -188,7 +188,7 @@ class UnavailableError(RlservoError):
 
 
 class OverloadedError(UnavailableError):
-    """The server has as much work as it takes on; nothing was computed."""
+    """The server is at capacity; nothing was computed."""
 
     code = "over-capacity"
 
@@ -199,19 +199,19 @@ class RateLimitError(UnavailableError):
     code = "rate-limited"
 
     def __init__(self, message: str, details: Mapping[str, Any] | None = None, *, key: str = "") -> None:
-        """`key` is the label of the API key that asked, where one did."""
+        """`key` is the label of the API key, if there was one."""
         super().__init__(message, {"key": key, **(details or {})} if key else details)
         self.key = key
 
 
 class LateError(UnavailableError):
-    """The observation waited longer than the server answers as fresh; nothing was computed."""
+    """The observation waited too long to count as fresh; nothing was computed."""
 
     code = "late"
 
 
 class ConflictError(RlservoError):
-    """A change of what is served that contradicts what is served now."""
+    """A change of the served versions that contradicts the present ones."""
 
     code = "conflict"
 
@@ -223,7 +223,7 @@ class RefusedError(ConflictError):
 
 
 class InternalError(RlservoError):
-    """The server failed, by a fault of its own."""
+    """The server failed through a fault of its own."""
 
     code = "internal"
 
@@ -246,7 +246,7 @@ class ForbiddenError(RlservoError):
     code = "forbidden"
 
     def __init__(self, message: str, details: Mapping[str, Any] | None = None, *, key: str = "") -> None:
-        """`key` is the label of the API key that asked, where one did."""
+        """`key` is the label of the API key, if there was one."""
         super().__init__(message, {"key": key, **(details or {})} if key else details)
         self.key = key
 

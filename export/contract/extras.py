@@ -12,12 +12,12 @@ from rlservo.export.contract.errors import UsageError
 
 
 def install(extra: str) -> str:
-    """Return how an extra is installed. There is no release yet, and PyPI's `rlservo` would not be ours."""
+    """Return the command that installs an extra. There is no release yet, and PyPI's `rlservo` would not be ours."""
     return f"pip install '.[{extra}]' in the checkout of rlservo"
 
 
 def missing(package: str | None, extra: str, what: str) -> str:
-    """Return the sentence about a package that is not installed."""
+    """Return the message about a package that is not installed."""
     return f"{what} needs the Python package {package!r}: {install(extra)}"
 
 

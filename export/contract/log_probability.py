@@ -1,6 +1,6 @@
 """Log-probability of a module's own action: RLlib's distributions over `action_dist_inputs`, in numpy.
 
-A module's own action is what its distribution gave, before RLlib unsquashes or clips it and before a Discrete space's
+A module's own action is its distribution's sample, before RLlib unsquashes or clips it and before a Discrete space's
 start is added: a clipped action has no density, and its probability cannot be found from what was sent.
 """
 

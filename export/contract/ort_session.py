@@ -1,4 +1,4 @@
-"""Open a graph in onnxruntime, with the same settings for the exporter's gate and for serving."""
+"""onnxruntime sessions, with the same settings for the exporter's gate and for serving."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def open_ort_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
-    """Return a session on the CPU with so many threads; one is fastest for networks of a policy's size.
+    """Return a session on the CPU with this number of threads; one is fastest for networks of a policy's size.
 
     The file is not needed afterwards. A graph can make onnxruntime read further files from the file's folder: one of
     unknown origin is opened as `Bundle.verified_copy`, which is in no folder.

@@ -17,7 +17,7 @@ BLOCK = 1 << 20  # [bytes]
 
 
 class NotReadableError(OSError):
-    """A file that is not read for what it is; `str()` is the reason, to follow the file's name."""
+    """A file of a kind that is not read; `str()` is the reason, to follow the file's name."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -29,7 +29,7 @@ class FileTooLargeError(NotReadableError):
 
 @contextmanager
 def open_regular(file: Path, max_bytes: int | None = None) -> Iterator[BinaryIO]:
-    """Open a regular file, or what a symbolic link to one leads to, for reading.
+    """Open a regular file, or a symbolic link to one, for reading.
 
     Raises NotReadableError when it is something else, FileTooLargeError beyond `max_bytes`, and OSError.
     """

@@ -13,16 +13,16 @@ from rlservo.export.contract.spaces import DiscreteSpec, LeafSpec, MultiDiscrete
 ACTION_DIST_INPUTS = "action_dist_inputs"
 """The graph's output of distribution parameters."""
 Q_VALUES = "q_values"
-"""The same of a policy that has Q-values in their place (DQN)."""
+"""The same for a policy with Q-values instead (DQN)."""
 
 
 def scores_name(outputs: Container[str]) -> str:
-    """Return which of a graph's outputs its actions are chosen by."""
+    """Return the graph's output by which actions are chosen."""
     return Q_VALUES if Q_VALUES in outputs else ACTION_DIST_INPUTS
 
 
 def parameter_count(leaf: LeafSpec) -> int:
-    """Return how many distribution parameters one action leaf has: a mean and a scale each, or a score a choice."""
+    """Return the number of distribution parameters of one action leaf: a mean and a scale each, or a score a choice."""
     if isinstance(leaf, DiscreteSpec):
         return leaf.n
     return sum(leaf.nvec) if isinstance(leaf, MultiDiscreteSpec) else 2 * leaf.size

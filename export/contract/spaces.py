@@ -19,7 +19,7 @@ class FrozenModel(BaseModel):
 
 
 class Element(FrozenModel):
-    """One number of an observation or an action, as a roboticist would call it."""
+    """Name and unit of one number of an observation or an action."""
 
     name: str
     unit: str = Field("", description="SI unit such as 'rad', 'm/s'; '1' when dimensionless, '' when unknown")

@@ -45,7 +45,7 @@ class ObservationNode(nn.Module, abc.ABC):
 
 
 def observation_nodes(recipe: Recipe) -> nn.ModuleList:
-    """Return one node a step of the recipe."""
+    """Return one node for each step of the recipe."""
     dtypes = {name: _dtype(space) for name, space in recipe.observation_leaves.items()}
     nodes = nn.ModuleList()
     for step in recipe.steps:
@@ -76,7 +76,7 @@ def _dtype(space: Any) -> torch.dtype:
 
 
 def _replace(obs: Tree, leaf: str, function: Callable[[Tensor], Tensor]) -> Tree:
-    """Return the observation with `function` applied to one leaf: all of it, or a Dict's key."""
+    """Return the observation with `function` applied to one leaf: the whole, or a Dict's key."""
     if leaf == "obs":
         return function(obs)
     key = leaf.removeprefix("obs.")

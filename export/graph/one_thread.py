@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Set torch to one thread and back: for networks of this size a second one costs more than it brings.
+    """Set torch to one thread and back: for networks of this size a second one costs more than it saves.
 
     On a busy machine it is much more: an LSTM's step of 0.1 ms was seen to take 11 ms with two.
     """

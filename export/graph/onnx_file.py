@@ -1,4 +1,4 @@
-"""Write a policy graph as one ONNX file, and run such a file.
+"""ONNX file of a policy graph: writing and running it.
 
 Of torch's two exporters the TorchScript-based one comes first: for these graphs it takes 0.2 s where the
 torch.export-based one takes 3 s, and the result is as small and as fast. If it lacks an operation (sinh), the other
@@ -52,7 +52,7 @@ def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
 
 
 def inputs_read(file: Path, *, without: str = "") -> set[str]:
-    """Return the names of what the graph's outputs are computed from, its inputs among them; `without` is one less."""
+    """Return the names that the graph's outputs are computed from, inputs included; `without` leaves one output out."""
     model = onnx.load(str(file))
     makers = {name: node for node in model.graph.node for name in node.output}
     waiting = [output.name for output in model.graph.output if output.name != without]
@@ -66,7 +66,7 @@ def inputs_read(file: Path, *, without: str = "") -> set[str]:
 
 
 def _reads(node: onnx.NodeProto) -> Iterator[str]:
-    """Yield what a node takes, and what the graphs inside it take from outside."""
+    """Yield a node's inputs, and the outer inputs of the graphs inside it."""
     yield from node.input
     for attribute in node.attribute:
         for graph in (attribute.g, *attribute.graphs):
@@ -76,7 +76,7 @@ def _reads(node: onnx.NodeProto) -> Iterator[str]:
 
 
 def _finish(file: Path, graph: PolicyGraph, example: Inputs) -> None:
-    """Check what torch wrote, which is not always ONNX (a logarithm of integers), and give it its last form.
+    """Check torch's output, which is not always valid ONNX (a logarithm of integers), and finish it.
 
     torch drops inputs that nothing reads, which TorchScript keeps: they are listed again. onnxruntime opens the file;
     it lacks kernels for some of ONNX, such as most double-precision functions.
@@ -137,7 +137,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _silent_descriptors() -> Iterator[None]:
-    """Send standard output and error to nowhere: torch's C++ prints the whole graph if it cannot convert it."""
+    """Discard standard output and error: torch's C++ prints the whole graph if it cannot convert it."""
     sys.stdout.flush()
     sys.stderr.flush()
     saved = [(descriptor, os.dup(descriptor)) for descriptor in (1, 2)]

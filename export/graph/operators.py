@@ -27,7 +27,7 @@ class exact_operators(TorchFunctionMode):  # entered like a function: `with exac
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
     ) -> Any:
-        """Return what `func` returns; torch takes the mode off meanwhile, so a composition may use its own operator."""
+        """Return `func`'s result; torch disables the mode meanwhile, so a composition may use its own operator."""
         name = str(getattr(func, "__name__", "")).removeprefix("linalg_").removeprefix("special_")
         in_place = name.endswith("_") and not name.endswith("__")
         name = name.removesuffix("_") if in_place else name
@@ -276,14 +276,14 @@ def _take_along_dim(x: Tensor, indices: Tensor, dim: int | None = None) -> Tenso
 
 
 def _log1p(x: Tensor) -> Tensor:
-    """Kahan's: the error of 1 + x is made good (HP-15C Advanced Functions Handbook, 1982)."""
+    """Kahan's compensation of the error of 1 + x (HP-15C Advanced Functions Handbook, 1982)."""
     more = 1.0 + x
     exact = torch.log(more) * (x / (more - 1.0))
     return torch.where(more == math.inf, more, torch.where(more != 1.0, exact, x))
 
 
 def _expm1(x: Tensor) -> Tensor:
-    """Kahan's, likewise."""
+    """Kahan's compensation, likewise."""
     power = torch.exp(x)
     less = power - 1.0
     exact = less * (x / torch.log(power))
@@ -324,7 +324,7 @@ _atan = _in_single_precision(torch.atan)
 
 
 def _asin(x: Tensor) -> Tensor:
-    """Of doubles through the arc tangent: near 1 the double's last bits decide."""
+    """For doubles by the arc tangent: near 1 the double's last bits decide."""
     return torch.asin(x) if x.dtype != torch.float64 else _atan2(x, torch.sqrt((1.0 - x) * (1.0 + x)))
 
 
@@ -400,4 +400,4 @@ EXACT: dict[str, Callable[..., Any]] = {
 """The compositions by the name of torch's function, for tensors of real numbers, with its arguments."""
 
 OF_INTEGERS_TOO = frozenset({"floor_divide", "__floordiv__", "__rfloordiv__", "div", "divide"})
-"""Of integers the TorchScript-based exporter makes -1 // 7 a 0."""
+"""For integers the TorchScript-based exporter turns -1 // 7 into 0."""

@@ -88,7 +88,7 @@ class PolicyGraph(nn.Module):
 
     @staticmethod
     def _unread(leaf: Any, like: Tensor) -> Tensor:
-        """Return what stands for a leaf that nothing reads, in `like`'s batch."""
+        """Return a placeholder for an unread leaf, in `like`'s batch."""
         one = torch.from_numpy(np.zeros(leaf.shape, leaf.dtype))
         return one.expand(like.shape[0], *leaf.shape)
 
@@ -100,7 +100,7 @@ def _append_code(codes: Tensor, action: Tensor, choices: int) -> Tensor:
 
 
 class ActionNode(nn.Module):
-    """The distribution's mode, then what RLlib does to it before `env.step`, for every leaf of the action."""
+    """The distribution's mode, then RLlib's transform before `env.step`, for every leaf of the action."""
 
     def __init__(self, recipe: Recipe) -> None:
         super().__init__()
@@ -118,7 +118,7 @@ class ActionNode(nn.Module):
         return self.finish([leaf.choose(part) for leaf, part in zip(self._leaves(), parts, strict=True)])
 
     def finish(self, chosen: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """Return what goes to the environment, given the leaves the policy chose."""
+        """Return the environment's action, given the leaves that the policy chose."""
         if self.user_steps:
             tree = build(self.space, chosen)
             for function in self.user_steps:
@@ -224,7 +224,7 @@ class ActionLeaf(nn.Module):
 
 
 def _same_everywhere(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[float, float] | None:
-    """Return the bounds as two numbers where all elements share finite ones: one node instead of two."""
+    """Return the bounds as two numbers if all elements share finite ones: one node instead of two."""
     first_low, first_high = float(low.flat[0]), float(high.flat[0])
     shared = bool(
         (low == first_low).all() and (high == first_high).all() and np.isfinite([first_low, first_high]).all()

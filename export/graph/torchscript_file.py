@@ -1,4 +1,4 @@
-"""Write a policy graph as TorchScript, and run such a file.
+"""TorchScript file of a policy graph: writing and running it.
 
 TorchScript is what C++ programs with libtorch and ROS nodes load; torch itself calls it deprecated in favour of
 torch.export.

@@ -1,4 +1,4 @@
-"""Explain why a network cannot be exported faithfully: operators, and numbers that tracing froze."""
+"""Reasons why a network cannot be exported faithfully: operators, and numbers that tracing froze."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def tracer_warning() -> type[Warning]:
 
 
 def frozen_by_tracing(caught: Sequence[warnings.WarningMessage]) -> list[str]:
-    """Return where, in code that is not an installed package's, a number left torch while it was traced."""
+    """Return the places, outside installed packages, where a number left torch while it was traced."""
     places = {
         f"{one.filename}:{one.lineno}"
         for one in caught
@@ -70,14 +70,14 @@ def raised_at(error: BaseException) -> str:
 
 
 def _cause(error: BaseException) -> BaseException:
-    """Return the exception that torch has wrapped in advice."""
+    """Return the exception that torch wrapped in advice."""
     while error.__cause__ is not None:
         error = error.__cause__
     return error
 
 
 def _refused_operators(error: BaseException) -> list[str]:
-    """Return ATen's names of the operators that an exception of torch.onnx says it cannot write."""
+    """Return ATen's names of the operators that an exception of torch.onnx reports as unsupported."""
     return re.findall(r"(?:operator '|OpOverload\(op=')aten(?:::|\.)(\w+)", f"{_cause(error)}\n{error}")
 
 

@@ -1,1 +1,1 @@
-"""Parity gate: an exported policy computes the trainer's own actions, or the reason why it does not."""
+"""Parity gate: proof that an exported policy computes the trainer's own actions, or the reason why not."""

@@ -61,7 +61,7 @@ class GraphLoop:
         return outputs
 
     def complete(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Inputs:
-        """Return the inputs with the state they meet."""
+        """Return the inputs with the loop's state."""
         rows = len(restart)
         full = dict(inputs)
         for name, initial in self._state.items():
@@ -78,7 +78,7 @@ class Reference:
     batch: Batch
     outputs: Outputs
     framework: str = "RLlib"
-    """Whose numbers they are, for messages."""
+    """Name of the framework, for messages."""
 
 
 def record(start_loop: Callable[[], Loop], batches: Sequence[Batch], framework: str = "RLlib") -> list[Reference]:
@@ -111,7 +111,7 @@ def _record(start_loop: Callable[[], Loop], batches: Sequence[Batch], framework:
 
 
 def record_perturbed(start_loop: Callable[[], Loop], references: Sequence[Reference]) -> list[Reference]:
-    """Return what the framework computes when every floating-point observation is moved up or down by its last bit."""
+    """Return the framework's outputs when every floating-point observation moves up or down by its last bit."""
     rng = np.random.default_rng(0)
     batches = [
         replace(each.batch, inputs={name: _by_last_bit(values, rng) for name, values in each.batch.inputs.items()})
@@ -131,7 +131,7 @@ def _by_last_bit(values: NDArray[Any], rng: np.random.Generator) -> NDArray[Any]
 def replay(
     references: Sequence[Reference], run: Runner, state: Sequence[StateLeaf]
 ) -> Iterator[tuple[Inputs, Outputs]]:
-    """Run an exported graph over what the framework computed; yield its full inputs and its outputs for each batch."""
+    """Run an exported graph on the reference's batches; yield its full inputs and its outputs for each."""
     loop, size = GraphLoop(run, state), 0
     for reference in references:
         inputs, restart = _copy(reference.batch.inputs), reference.batch.restart
@@ -151,7 +151,7 @@ def prove(
     reference: str = "",
     perturb: Callable[[], list[Reference]] | None = None,
 ) -> Parity:
-    """Compare every format with what the framework computed and return the largest differences.
+    """Compare every format with the framework's outputs and return the largest differences.
 
     `labels` name the action's elements for the message; `reference` names the reference for the contract;
     `perturb` gives what `record_perturbed` does; it is called once, only if a difference is too large.
@@ -282,7 +282,7 @@ def _compare(
 
 
 def _scale(expected: NDArray[np.float64], space: Any, least: float) -> NDArray[np.float64]:
-    """Return the size of number that rounding is measured against, broadcastable to `expected`."""
+    """Return the scale that rounding is measured against, broadcastable to `expected`."""
     if isinstance(space, Box) and bool((space.bounded_below & space.bounded_above).all()):
         return (space.high.astype(np.float64) - space.low.astype(np.float64))[None] / 2
     measured = np.isfinite(expected) & (np.abs(np.nan_to_num(expected)) < MASKED)

@@ -1,4 +1,4 @@
-"""Explain why an exported graph differs from the trainer's own numbers."""
+"""Reasons why an exported graph differs from the trainer's own numbers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def why_different(start_loop: Callable[[], Loop], references: Sequence[Reference
 
 
 def _depends_on_batch(start_loop: Callable[[], Loop], references: Sequence[Reference]) -> list[int]:
-    """Return a sample whose action is another without the rest of its batch, if there is one."""
+    """Return a sample whose action changes without the rest of its batch, if there is one."""
     for reference in references:
         batch = reference.batch
         if batch.restart is not None or len(batch) < ALONE:

@@ -1,4 +1,4 @@
-"""Describe, for people and programs, the steps baked into a graph, in the order they are applied."""
+"""Description of the steps baked into a graph, for people and programs, in the order they are applied."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any, unread: Sequence
 
 
 def unexpected_steps(recipe: Recipe) -> list[str]:
-    """Return a sentence for each thing that RLlib does, and the export with it, and a person may not expect."""
+    """Return a sentence for each surprising behaviour of RLlib that the export reproduces."""
     sentences: list[str] = []
     for name, space in recipe.action_leaves.items():
         if isinstance(space, Discrete) and space.start != 0:

@@ -31,7 +31,7 @@ class ObservationFilter:
     count: int
     """Number of observations the statistics were gathered from."""
     mean: NDArray[np.float64]
-    """Of the observation's shape, in its units."""
+    """Mean, of the observation's shape, in its units."""
     std: NDArray[np.floating[Any]]
     """Of RLlib's unbiased (n - 1), zero for n <= 1, and single precision because RLlib computes it so."""
     clip: float | None
@@ -42,16 +42,16 @@ class ObservationFilter:
     epsilon: float = SMALL_NUMBER
     """Number added to the standard deviation."""
     leaf: str = "obs"
-    """Which part of the observation is filtered, by input name."""
+    """The filtered part of the observation, by input name."""
     keeps_integers: bool = True
     """Whether filtered integers are cut back to integers, as RLlib does it."""
 
     def offset(self) -> NDArray[np.float64]:
-        """Return what is subtracted, of the observation's shape."""
+        """Return the subtrahend, of the observation's shape."""
         return self.mean if self.demean else np.zeros_like(self.mean)
 
     def divisor(self) -> NDArray[np.floating[Any]]:
-        """Return what divides, of the observation's shape."""
+        """Return the divisor, of the observation's shape."""
         return self.std + self.std.dtype.type(self.epsilon) if self.destd else np.ones_like(self.std)
 
 
@@ -78,7 +78,7 @@ class FrameStack:
     dtype: str
     every: int = 1
     leaf: str = "obs"
-    """Which part of the observation is stacked, by input name."""
+    """The stacked part of the observation, by input name."""
     channels_first: bool = False
     """Whether the frames are side by side on the first axis."""
 
@@ -88,7 +88,7 @@ class FrameStack:
 
     @property
     def past_shape(self) -> tuple[int, ...]:
-        """The shape of the frames that are kept."""
+        """The shape of the kept frames."""
         kept = (self.frames - 1) * self.every
         if self.channels_first:
             return (kept * self.shape[0], *self.shape[1:])
@@ -162,7 +162,7 @@ DistributionKind: TypeAlias = Literal["diag_gaussian", "squashed_gaussian", "cat
 
 @dataclass(frozen=True)
 class StateLeaf:
-    """One array a policy carries from step to step, and what it is at an episode's start."""
+    """One array that a policy carries from step to step, and its initial value."""
 
     name: str
     initial: NDArray[Any]
@@ -174,9 +174,9 @@ class Affine:
     """An environment's scaling of a policy's numbers: `clip(action, -limit, limit) * scale + offset`."""
 
     scale: NDArray[np.float32]
-    """Of the action's shape, in its units."""
+    """Scale, of the action's shape, in its units."""
     offset: NDArray[np.float32]
-    """The same."""
+    """Offset, the same."""
     limit: float | None = None
 
     def apply(self, action: NDArray[Any]) -> NDArray[Any]:
@@ -213,7 +213,7 @@ class Recipe:
 
     @property
     def first_filters(self) -> dict[str, ObservationFilter]:
-        """The filters that meet the raw observation, by the leaf they are of."""
+        """The filters of the raw observation, by leaf."""
         first = itertools.takewhile(lambda step: isinstance(step, ObservationFilter), self.steps)
         return {step.leaf: step for step in first if isinstance(step, ObservationFilter)}
 
@@ -229,7 +229,7 @@ class Recipe:
 
     @property
     def state(self) -> tuple[StateLeaf, ...]:
-        """All that is carried from step to step: of the observation steps first, then of the network."""
+        """All state that is carried from step to step: the observation steps' first, then the network's."""
         carried: list[StateLeaf] = []
         for step in self.steps:
             if isinstance(step, FrameStack):
@@ -250,7 +250,7 @@ class Recipe:
 
 
 def parameter_count(space: Any) -> int:
-    """Return how many distribution parameters one action leaf has."""
+    """Return the number of distribution parameters of one action leaf."""
     if isinstance(space, Box | MultiBinary):
         return 2 * math.prod(space.shape)
     if isinstance(space, MultiDiscrete):
@@ -259,7 +259,7 @@ def parameter_count(space: Any) -> int:
 
 
 def leaf_transform(space: Any, transform: Transform) -> Transform:
-    """Return what happens to one action leaf: only a Box is touched, and unsquashed only if bounded on all sides."""
+    """Return the transform of one action leaf: only for a Box, and unsquashed only if bounded on all sides."""
     if not isinstance(space, Box):
         return "none"
     if transform == "unsquash" and not bool((space.bounded_below & space.bounded_above).all()):

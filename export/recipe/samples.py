@@ -31,7 +31,7 @@ NEW_EPISODE = 0.02  # probability that a row's episode ends at a step, besides t
 
 @dataclass(frozen=True)
 class Batch:
-    """Observations by input name in the space's dtypes, and what kind they are.
+    """Observations by input name in the space's dtypes, and their kind.
 
     In a sequence, `restart` marks the rows that begin an episode; the other rows continue from the batch before. None
     is a batch of its own.

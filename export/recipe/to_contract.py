@@ -1,4 +1,4 @@
-"""Translate Gymnasium's spaces, and a policy's state, into the contract's terms."""
+"""Translation of Gymnasium's spaces, and a policy's state, into the contract's terms."""
 
 from __future__ import annotations
 
@@ -85,6 +85,6 @@ def state_spec(leaf: StateLeaf) -> StateSpec:
 
 
 def _bound(values: NDArray[Any]) -> float | tuple[float | None, ...] | None:
-    """Return one number where all elements share it, None for infinity."""
+    """Return one number if all elements share it, None for infinity."""
     flat = [float(value) if np.isfinite(value) else None for value in values.ravel()]
     return flat[0] if len(set(flat)) == 1 else tuple(flat)

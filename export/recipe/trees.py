@@ -29,7 +29,7 @@ def children(space: Any) -> dict[Any, Any] | None:
 
 
 def is_nested(space: Any) -> bool:
-    """Return whether the space has parts that are arrays of their own."""
+    """Return whether the space has several arrays."""
     return isinstance(space, spaces.Dict | spaces.Tuple)
 
 

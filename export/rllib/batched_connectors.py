@@ -48,7 +48,7 @@ def use_batched_connectors(
     num_frames: int = 1,
     every: int = 1,
 ) -> None:
-    """Put these pieces in the place of RLlib's in an `AlgorithmConfig`.
+    """Replace RLlib's pieces by these in an `AlgorithmConfig`.
 
     Of the observation's elements `logarithm_of` (their indices) the logarithm is taken, of `sine_and_cosine_of` both;
     `observation_filter` is whether observations then go through a MeanStdFilter; the network sees the last `num_frames`
@@ -156,7 +156,7 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
 
 
 class _OfElements(ConnectorV2):
-    """A function of some elements of a vector, which comes in the observation's place."""
+    """A function of some elements of a vector that replaces the observation."""
 
     WHAT: ClassVar[str]
 
@@ -172,7 +172,7 @@ class _OfElements(ConnectorV2):
         super().__init__(input_observation_space, input_action_space, **kwargs)
 
     def get_ctor_args_and_kwargs(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
-        """Return what a checkpoint keeps; RLlib itself looks for the arguments in the class alone (ray 2.60)."""
+        """Return the state for a checkpoint; RLlib itself looks for the arguments in the class alone (ray 2.60)."""
         arguments, named = super().get_ctor_args_and_kwargs()
         return arguments, {**named, "elements": tuple(self.elements)}
 
@@ -193,11 +193,11 @@ class _OfElements(ConnectorV2):
         return batch
 
     def changed(self, row: Any) -> Any:
-        """Return what comes in the place of one observation."""
+        """Return the replacement of one observation."""
         raise NotImplementedError
 
     def bounds(self, low: Any, high: Any) -> tuple[Any, Any]:
-        """Return the bounds of that."""
+        """Return the replacement's bounds."""
         raise NotImplementedError
 
 
@@ -342,7 +342,7 @@ def _draw(inputs: torch.Tensor) -> dict[str, Any]:
 
 
 def _is_gaussian(module: Any, outputs: dict[str, Any]) -> bool:
-    """Return whether `_draw` does for the actions to these outputs of a network."""
+    """Return whether `_draw` suits the actions of these network outputs."""
     return (
         Columns.ACTIONS not in outputs
         and module.get_exploration_action_dist_cls() is TorchDiagGaussian
@@ -402,7 +402,7 @@ def _evaluate(module: Any) -> Any:
 
 
 def _array(value: Any) -> Any:
-    """Return a tensor or array as RLlib's `convert_to_numpy` does, and whatever else through it."""
+    """Return a tensor or array as RLlib's `convert_to_numpy` does, and anything else through it."""
     array = value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else value
     if not isinstance(array, np.ndarray) or array.ndim == 0:
         return convert_to_numpy(value)

@@ -175,7 +175,7 @@ class BatchedEnvRunner(SingleAgentEnvRunner):
             )
 
     def _cut(self) -> list[SingleAgentEpisode]:
-        """Return what there is of the episodes that continue, and let them continue after it."""
+        """Return the present parts of unfinished episodes, and let them continue."""
         parts = self._ongoing_episodes
         lookback = self.config.episode_lookback_horizon
         self._ongoing_episodes = [part.cut(len_lookback_buffer=lookback) for part in parts]

@@ -1,4 +1,4 @@
-"""Find a distribution's kind, and the rule by which its deterministic action comes out of its parameters.
+"""A distribution's kind, and the rule from its parameters to the deterministic action.
 
 If it follows none of the known rules, the distribution itself goes into the graph (mode "given"), if it gives the same
 action twice.
@@ -29,12 +29,12 @@ RLLIBS_OWN = ("ray.rllib.core.distribution.", "ray.rllib.models.torch.torch_acti
 
 
 def distribution_kind(kind: type) -> DistributionKind | None:
-    """Return which of RLlib's distributions a class is; None for the user's own, whose samples are not known."""
+    """Return the kind of RLlib's distribution class; None for the user's own, whose samples are not known."""
     return DISTRIBUTIONS.get(kind.__name__) if kind.__module__.startswith(RLLIBS_OWN) else None
 
 
 def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: Any, given: Tensor) -> Mode:
-    """Return how the deterministic action of distribution `name` comes out of its parameters.
+    """Return the rule from the parameters of distribution `name` to its deterministic action.
 
     `deterministic` gives it for parameters `[batch, n]`, such as the network's own `given`; "given" means that no known
     rule does and the distribution has to be asked. Raises UnsupportedError if it fails or answers at random.
@@ -73,7 +73,7 @@ def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: 
 
 
 def _known(space: Any, action: Tensor, part: Tensor) -> Mode | None:
-    """Return the rule by which `action` comes out of `part`, its parameters."""
+    """Return the rule from the parameters `part` to `action`."""
     if not isinstance(space, Box):
         sizes = [int(n) for n in space.nvec] if hasattr(space, "nvec") else [int(space.n)]
         best = torch.stack([torch.argmax(one, dim=-1) for one in torch.split(part, sizes, dim=-1)], dim=-1)

@@ -12,7 +12,7 @@ from rlservo.export.recipe.recipe import ObservationFilter, Recipe
 
 
 def frozen_filter(running: Any) -> ObservationFilter:
-    """Return what a `ray.rllib.utils.filter.MeanStdFilter` does as it stands. Raises CheckpointError if it diverged."""
+    """Return the frozen form of a `ray.rllib.utils.filter.MeanStdFilter`. Raises CheckpointError if it diverged."""
     stats = running.running_stats
     mean, std = np.asarray(stats.mean, np.float64), np.asarray(stats.std, np.float32)
     if not (np.isfinite(mean).all() and np.isfinite(std).all()):

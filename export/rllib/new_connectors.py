@@ -1,4 +1,4 @@
-"""Read off RLlib's new-stack connector pipelines what they do to an observation and to an action.
+"""Steps of RLlib's new-stack connector pipelines for an observation and an action, read from their pieces.
 
 A piece that is not known is refused by its class name, because leaving it out would change the policy. The pieces are
 known by name and by coming from RLlib itself. A piece of the user's own is used if it offers `torch_forward`, a
@@ -50,7 +50,7 @@ PLUMBING = frozenset({
 BATCHES_OBSERVATION = frozenset({"AddObservationsFromEpisodesToBatch", "FrameStacking"})
 """Pieces that put the observation into the batch: later changes to the episode come too late."""
 BATCHED_CONNECTORS = "rlservo.export.rllib.batched_connectors"
-"""Pieces that do what RLlib's of the same names do; those for observations also batch them."""
+"""Pieces that work like RLlib's of the same names; those for observations also batch them."""
 
 HOOK = "torch_forward"
 
@@ -62,7 +62,7 @@ class AgentSlot:
     agent: Any = None
     module: str = ""
     agents: tuple[str, ...] = ()
-    """All agents for whom this one stands."""
+    """All agents that this one represents."""
 
     def part(self, space: Any) -> Any:
         """Return the agent's own part of a space, which behind the mapping is its module's.
@@ -78,7 +78,7 @@ SINGLE_AGENT = AgentSlot()
 
 
 def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: AgentSlot) -> tuple[ObservationStep, ...]:
-    """Return what the env-to-module pipeline does to an observation of the slot's agent, and freeze the pipeline.
+    """Return the env-to-module pipeline's steps for the slot's agent, and freeze the pipeline.
 
     Raises UnsupportedError for a piece that is not known, CheckpointError when a filter's statistics are missing.
     """
@@ -106,7 +106,7 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: Age
 
 
 def read_action_steps(module_to_env: Any, action_space: Any) -> tuple[Transform, tuple[UserStep, ...]]:
-    """Return what the module-to-env pipeline does to an action (`unsquash_action`, `clip_action` in ray 2.60)."""
+    """Return the module-to-env pipeline's transform of an action (`unsquash_action`, `clip_action` in ray 2.60)."""
     transform: Transform = "none"
     steps: list[UserStep] = []
     for piece in module_to_env.connectors:
@@ -133,7 +133,7 @@ def read_action_steps(module_to_env: Any, action_space: Any) -> tuple[Transform,
 
 
 def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> ObservationStep | None:
-    """Return what an env-to-module piece does to an observation (None: nothing); freeze it while at it."""
+    """Return an env-to-module piece's step (None: no effect), and freeze the piece."""
     kind = type(piece)
     if not _comes_from_rllib(kind):
         return _user_step(piece, "env-to-module", "the network would see other numbers")

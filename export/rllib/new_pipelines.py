@@ -1,4 +1,4 @@
-"""Run RLlib's own connector pipelines of the new API stack for one agent, alone or among several.
+"""RLlib's own connector pipelines of the new API stack, run for one agent, alone or among several.
 
 If an environment has several agents, the episode is one in which only the exported policy's agent acts: an
 agent's action depends on its own observations alone, because a module that looks at others' is refused. It imports
@@ -44,7 +44,7 @@ class Pipelines:
     """Argument of RLlib's connectors: the module, or a MultiRLModule that holds it alone."""
 
     def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return (the module's batch, what the pipelines pass to each other)."""
+        """Return (the module's batch, the data that the pipelines share)."""
         shared: dict[str, Any] = {}
         with torch.no_grad():
             batch = self.env_to_module(
@@ -53,13 +53,13 @@ class Pipelines:
         return batch, shared
 
     def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
-        """Return what the module gives for its batch, which it may change."""
+        """Return the module's output for its batch, which it may change."""
         with torch.no_grad():
             given: dict[str, Any] = self.module.forward_inference(own_copy(batch))
         return given
 
     def to_env(self, given: dict[str, Any], episodes: list[Any], shared: dict[str, Any]) -> dict[str, Any]:
-        """Return what comes out for the environment and for the episodes."""
+        """Return the outputs for the environment and for the episodes."""
         with torch.no_grad():
             sent: dict[str, Any] = self.module_to_env(
                 rl_module=self.connector_module, batch=given, episodes=episodes, explore=False, shared_data=shared
@@ -73,7 +73,7 @@ class Pipelines:
         return episode
 
     def advance(self, episode: Any, obs: Any, action: Any, reward: float, extra: dict[str, Any]) -> None:
-        """Tell an episode of one more step."""
+        """Add a step to an episode."""
         episode.add_env_step(observation=obs, action=action, reward=reward, extra_model_outputs=extra)
 
 
@@ -84,12 +84,12 @@ class MultiAgentPipelines(Pipelines):
     slot: AgentSlot
 
     def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return (the module's batch, what the pipelines pass to each other)."""
+        """Return (the module's batch, the data that the pipelines share)."""
         batch, shared = super().to_module(episodes)
         return batch[self.slot.module], shared
 
     def to_env(self, given: dict[str, Any], episodes: list[Any], shared: dict[str, Any]) -> dict[str, Any]:
-        """Return what comes out for the environment and for the episodes, of the one agent."""
+        """Return the agent's outputs for the environment and for the episodes."""
         sent = super().to_env({self.slot.module: given}, episodes, shared)
         own = {name: [by_agent[self.slot.agent] for by_agent in rows] for name, rows in sent.items()}
         acting = (Columns.ACTIONS, Columns.ACTIONS_FOR_ENV)
@@ -107,7 +107,7 @@ class MultiAgentPipelines(Pipelines):
         return episode
 
     def advance(self, episode: Any, obs: Any, action: Any, reward: float, extra: dict[str, Any]) -> None:
-        """Tell an episode of one more step."""
+        """Add a step to an episode."""
         agent = self.slot.agent
         episode.add_env_step(
             observations={agent: obs},
@@ -120,7 +120,7 @@ class MultiAgentPipelines(Pipelines):
 def pipelines_of(
     slot: AgentSlot, module: Any, env_to_module: Any, module_to_env: Any, observation_space: Any, action_space: Any
 ) -> Pipelines:
-    """Return RLlib's way to act for the slot's agent, whose own the spaces are."""
+    """Return RLlib's way to act for the slot's agent, with the agent's own spaces."""
     if slot is SINGLE_AGENT:
         return Pipelines(module, env_to_module, module_to_env, observation_space, action_space, module)
     together = MultiRLModule()
@@ -164,7 +164,7 @@ def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, mod
 
 
 def _served(mapping: Any, module_id: str, module: Any) -> list[Any]:
-    """Return the agents that a module serves, as RLlib asks it.
+    """Return the agents that a module serves, by RLlib's mapping.
 
     All that it could serve if that is drawn in each episode, or if the module was added in training.
     """
@@ -186,7 +186,7 @@ def _served(mapping: Any, module_id: str, module: Any) -> list[Any]:
 
 
 def _treatment(slot: AgentSlot, files: CheckpointFiles, env_to_module: Any, module_to_env: Any) -> tuple[Any, ...]:
-    """Return all that may differ between agents that share a module."""
+    """Return everything that may differ between agents that share a module."""
     steps: list[BakedStep] = [observation_step(step) for step in read_observation_steps(env_to_module, files, slot)]
     return slot.part(env_to_module.input_observation_space), slot.part(module_to_env.input_action_space), steps
 

@@ -1,4 +1,4 @@
-"""Restore a policy of RLlib's new API stack, and run it as RLlib itself would.
+"""A policy of RLlib's new API stack, restored and run as RLlib itself would.
 
 The module and both connector pipelines come from their own folders in the checkpoint; `new_connectors.py` reads off
 them what they do. `NewStackLoop` is RLlib's own pipelines around RLlib's own forward pass.
@@ -169,7 +169,7 @@ class NewStackLoop:
         return {name: np.concatenate([one[name] for one in outputs]) for name in outputs[0]}
 
     def _decide(self, episodes: list[Any]) -> Outputs:
-        """Return what RLlib computes for these episodes, and remember what they need with the next step."""
+        """Return RLlib's outputs for these episodes, and keep the state for the next step."""
         batch, shared = self.pipelines.to_module(episodes)
         forward = self.pipelines.forward(batch)
         outputs = self._outputs(batch, forward)
@@ -326,7 +326,7 @@ def _restore(kind: Any, folder: Path) -> Any:
 
 @contextlib.contextmanager
 def _explained(folder: Path) -> Iterator[None]:
-    """Raise CheckpointError where what is in `folder` cannot be restored."""
+    """Raise CheckpointError if the content of `folder` cannot be restored."""
     unpickle(folder / CTOR_FILE)  # RLlib's own loader hides a missing class behind an unrelated error
     deprecation = logging.getLogger("ray._common.deprecation")
     deprecation.addFilter(_not_rllibs_own)
@@ -341,7 +341,7 @@ def _explained(folder: Path) -> Iterator[None]:
 
 
 def _other_ray(folder: Path) -> str:
-    """Return what to do where another Ray wrote a part that this one cannot read; empty if it was this one."""
+    """Return advice for a part that another Ray wrote and this one cannot read; empty if it was this one."""
     try:
         written_by = str(json.loads((folder / "metadata.json").read_text(encoding="utf-8"))["ray_version"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -381,7 +381,7 @@ def _check_weights(files: CheckpointFiles, module: Any) -> str:
 
 
 def _unneeded(module: Any) -> list[str]:
-    """Return the names of the parts that inference does without."""
+    """Return the names of the parts that inference does not need."""
     return module.get_non_inference_attributes() if isinstance(module, InferenceOnlyAPI) else []
 
 
@@ -422,7 +422,7 @@ def _action_rule(
 
 
 def _deterministic(module: Any) -> Callable[[Tensor], Tree]:
-    """Return what RLlib's `GetActions` does with the module's numbers while it does not explore (ray 2.60)."""
+    """Return the actions that RLlib's `GetActions` takes from the module's numbers without exploring (ray 2.60)."""
     kind = module.get_inference_action_dist_cls()
     return lambda inputs: kind.from_logits(inputs).to_deterministic().sample()
 

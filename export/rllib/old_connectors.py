@@ -1,4 +1,4 @@
-"""Read off the old API stack's agent and action connectors what they do to an observation and to an action.
+"""Steps of the old API stack's agent and action connectors for an observation and an action.
 
 They live in the policy's state. A piece that is not known is refused by its name, because leaving it out would change
 the policy. As in `new_connectors.py` the pieces are known by name.
@@ -52,7 +52,7 @@ def check_connectors(state: Mapping[str, Any]) -> None:
 
 
 def read_old_steps(agent_connectors: Any) -> tuple[ObservationStep, ...]:
-    """Return what the agent connectors do to an observation, and freeze them.
+    """Return the agent connectors' steps for an observation, and freeze them.
 
     Raises UnsupportedError for a preprocessor that is not exported, CheckpointError for a filter that diverged.
     """
@@ -72,7 +72,7 @@ def read_old_steps(agent_connectors: Any) -> tuple[ObservationStep, ...]:
 
 
 def read_old_transform(action_connectors: Any, action_space: Any) -> Transform:
-    """Return what the action connectors do to a Box action (to others they do nothing).
+    """Return the action connectors' transform of a Box action (others are left unchanged).
 
     Unlike the new stack's one connector, here `clip_actions` also clips where `normalize_actions` finds a bound
     missing and leaves the action as it is (ray/rllib/connectors/action/, ray 2.60).

@@ -1,4 +1,4 @@
-"""Find the classes of an old-stack custom model and action distribution, which a checkpoint often holds by name only.
+"""Classes of an old-stack custom model and action distribution, which a checkpoint often holds only by name.
 
 `ModelCatalog.register_custom_model("mine", Mine)` puts the class into a registry of the training process, and
 `{"custom_model": "mine"}` into the checkpoint: no other process can restore it, RLlib's own included. The user's code
@@ -96,7 +96,7 @@ def _find_class(part: _Part, name: str, app_dir: Path) -> Any:
 
 
 def find_registrations(file: Path, app_dir: Path, name: str, call: str = REGISTER) -> Iterator[Registration]:
-    """Yield what `file`, somewhere below `app_dir`, registers under `name` with `call`."""
+    """Yield the classes that `file`, below `app_dir`, registers under `name` with `call`."""
     try:
         text = file.read_text(encoding="utf-8")
         tree = ast.parse(text) if call in text else None
@@ -122,7 +122,7 @@ def find_registrations(file: Path, app_dir: Path, name: str, call: str = REGISTE
 
 
 def _branches(node: ast.expr) -> Iterator[ast.expr]:
-    """Yield what an expression may be: RLlib's examples register `A if framework == "torch" else B`."""
+    """Yield the possible values of an expression: RLlib's examples register `A if framework == "torch" else B`."""
     if isinstance(node, ast.IfExp):
         yield from _branches(node.body)
         yield from _branches(node.orelse)

@@ -1,4 +1,4 @@
-"""Restore a policy of RLlib's old API stack, and run it as RLlib itself would.
+"""A policy of RLlib's old API stack, restored and run as RLlib itself would.
 
 `OldStackLoop` is the policy's own agent connectors, `compute_actions_from_input_dict` and action connectors, as
 `EnvRunnerV2` calls them. `Policy.compute_single_action` would leave filter, preprocessor and unsquashing out.

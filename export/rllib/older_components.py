@@ -15,7 +15,7 @@ from rlservo.export.rllib import private_names
 UNCHANGED = (2, 48)
 """First Ray whose checkpoints `Checkpointable.from_checkpoint` reads as today's."""
 CONFIG_OBJECT = "RLModuleConfig"
-"""Up to Ray 2.38 a module was made from one of these, which holds what are arguments today."""
+"""Up to Ray 2.38 a module was made from one of these; its content is passed as arguments today."""
 CONSTANT = "log_std_clip_param_const"
 """A setting that is among a module's weights since Ray 2.37 or 2.38."""
 TIME_AXIS, STATES = "AddTimeDimToBatchAndZeroPad", "AddStatesFromEpisodesToBatch"
@@ -33,7 +33,7 @@ def is_older(folder: Path) -> bool:
 
 
 def restore_older(folder: Path) -> Any:
-    """Return the module or pipeline in `folder`. Raises CheckpointError, or what its constructor raises."""
+    """Return the module or pipeline in `folder`. Raises CheckpointError, or its constructor's errors."""
     arguments, settings = _arguments(folder)
     if arguments and type(arguments[0]).__name__ == CONFIG_OBJECT:
         settings = dict(vars(arguments[0]))
@@ -75,7 +75,7 @@ def set_saved_state(pipeline: Any, folder: Path) -> None:
 
 
 def _arguments(folder: Path) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Return what a pipeline's constructor is given."""
+    """Return the arguments of a pipeline's constructor."""
     arguments: tuple[tuple[Any, ...], dict[str, Any]] = unpickle(folder / CTOR_FILE)["ctor_args_and_kwargs"]
     return arguments
 
@@ -92,7 +92,7 @@ def _set_state(component: Any, folder: Path) -> None:
 
 
 def _with_time_axis(connectors: list[Any]) -> list[Any]:
-    """Return a pipeline's connectors, with what `AddStatesFromEpisodesToBatch` did up to Ray 2.40 as one of its own."""
+    """Return a pipeline's connectors; part of `AddStatesFromEpisodesToBatch` (up to Ray 2.40) is a separate one."""
     names = [kind.__name__ for kind, *_ in connectors]
     if STATES not in names or TIME_AXIS in names:
         return connectors

@@ -1,4 +1,4 @@
-"""Policy states of the old API stack that an older Ray saved, changed into what today's (2.60) restores."""
+"""Policy states of the old API stack that an older Ray saved, converted for today's (2.60)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _FILTERS = {
 
 
 def update_policy_state(state: dict[str, Any], files: OldStackFiles) -> None:
-    """Change what older Rays saved otherwise. Raises UnsupportedError for what RLlib no longer has."""
+    """Convert parts that older Rays saved differently. Raises UnsupportedError for those that RLlib no longer has."""
     spec = state["policy_spec"]
     spec["policy_class"] = _policy_class(spec.get("policy_class"))
     config = spec.get("config") or {}
@@ -77,7 +77,7 @@ def _replace_module(state: dict[str, Any], config: dict[str, Any]) -> None:
 
 
 def _connectors(config: Mapping[str, Any], files: OldStackFiles) -> dict[str, Any]:
-    """Return the connectors that do what a worker did without, which was the default up to Ray 2.3."""
+    """Return connectors equal to a worker's processing without connectors, the default up to Ray 2.3."""
     agent: list[tuple[str, Any]] = []
     if not config.get("_disable_preprocessor_api"):
         agent.append(("ObsPreprocessorConnector", None))

@@ -15,7 +15,7 @@ KNOWN = "2.60"
 
 
 def find(module: str, name: str) -> Any:
-    """Return what a module of Ray calls so. Raises UnsupportedError if this Ray has no such thing."""
+    """Return an object of a module of Ray by name. Raises UnsupportedError if this Ray does not have it."""
     try:
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError):
@@ -23,7 +23,7 @@ def find(module: str, name: str) -> Any:
 
 
 def get(owner: Any, name: str) -> Any:
-    """Return an object's attribute. Raises UnsupportedError if this Ray's has none of that name."""
+    """Return an object's attribute. Raises UnsupportedError if it does not exist in this Ray."""
     try:
         return getattr(owner, name)
     except AttributeError:
@@ -31,7 +31,7 @@ def get(owner: Any, name: str) -> Any:
 
 
 def replace(owner: Any, name: str, value: Any) -> None:
-    """Set an attribute that is there: under a name that this Ray does not know, nothing would come of it."""
+    """Set an existing attribute: under a name that this Ray does not know, it would have no effect."""
     get(owner, name)
     setattr(owner, name, value)
 

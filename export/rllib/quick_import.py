@@ -1,4 +1,4 @@
-"""Imports of torch and RLlib in less time, for a process that only restores a checkpoint.
+"""Faster imports of torch and RLlib, for a process that only restores a checkpoint.
 
 The `__init__` of nearly every package of Ray's imports all modules below it, so that one RLModule brings Tune, Train,
 Data, pandas and every algorithm (ray 2.60): 1.2 s of processor time for nothing. While this module imports what any
@@ -23,7 +23,7 @@ from typing import Any
 DEFERRED = ("ray.rllib", "ray.tune", "ray.train", "ray.data", "ray.air")
 """These packages, and those below them, are deferred."""
 AT_ONCE = ("ray.rllib.connectors", "ray.rllib.core")
-"""But not these: a checkpoint's pipelines and networks name any module of theirs."""
+"""Except these: a checkpoint's pipelines and networks may name any of their modules."""
 ELSEWHERE = {
     ("ray.train", "Checkpoint"): "ray.train._checkpoint",
     ("ray.tune", "Checkpoint"): "ray.tune.trainable.trainable_fn_utils",
@@ -42,7 +42,7 @@ _TORCH_LIBRARY = "lib/libtorch_python.so"
 
 
 def prepare() -> None:
-    """Let this process import less from now on; for a program of ours, as it changes how Ray's packages load.
+    """Let this process import less from now on; only for our own programs, as it changes how Ray's packages load.
 
     torch's shared libraries are mapped while other modules are imported, which takes none of Python's lock: a quarter
     of a second of torch's import.
@@ -63,7 +63,7 @@ def _load_torch_library() -> None:
 
 
 def import_needed() -> None:
-    """Import what restoring takes, and little else, in a process that was prepared for it.
+    """Import what restoring needs, and little else, in a process that was prepared for it.
 
     Where another version of RLlib cannot be imported so, it is imported as usual.
     """
@@ -76,7 +76,7 @@ def import_needed() -> None:
 
 
 class _Finder:
-    """Finds Ray's packages as Python does, and defers them; later, runs what was deferred above a module first."""
+    """Finder of Ray's packages that defers them, and later runs the deferred packages above a module first."""
 
     def __init__(self) -> None:
         self.is_deferring = False
@@ -107,7 +107,7 @@ class _Finder:
 
 
 class _Loader:
-    """Makes a package's module and leaves running its `__init__` to the first use."""
+    """Loader that makes a package's module and runs its `__init__` at the first use."""
 
     def __init__(self, loader: Any, finder: _Finder) -> None:
         self._loader = loader
@@ -142,7 +142,7 @@ class _DeferredPackage(ModuleType):
 
 
 def _run_above(name: str) -> None:
-    """Run what was deferred above a module, outermost first, as importing it does otherwise."""
+    """Run the deferred packages above a module, outermost first, as importing it normally does."""
     parts = name.split(".")
     for count in range(1, len(parts)):
         package = sys.modules.get(".".join(parts[:count]))

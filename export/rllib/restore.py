@@ -1,4 +1,4 @@
-"""Restore a checkpoint of either API stack into the form that the exporter works with."""
+"""Restoring of a checkpoint of either API stack into the form that the exporter works with."""
 
 from __future__ import annotations
 

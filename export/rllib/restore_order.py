@@ -21,7 +21,7 @@ DECISIVE = ("_is_online", "create_local_env_runner", "num_env_runners")
 def connectors_that_rllib_restores(files: CheckpointFiles) -> Path:
     """Return the folder of training's pipelines.
 
-    It is the one found by name where RLlib restores none (recorded data) or the checkpoint has no configuration to ask.
+    It is the one found by name if RLlib restores none (recorded data) or the checkpoint has no configuration.
     Raises CheckpointError where RLlib's folder is missing: the pipelines that are there are others'.
     """
     file = files.root / CTOR_FILE

@@ -98,7 +98,7 @@ def action_terms(env: Mapping[str, Any], size: int, limit: float | None) -> Acti
 def _term(
     env: Mapping[str, Any], term: Mapping[str, Any], size: int | None, notes: list[str]
 ) -> tuple[list[str], str, list[float], list[float]]:
-    """Return one term's joint names (empty where unknown), unit, scale and offset. Raises ValueError saying why not."""
+    """Return one term's joint names (empty if unknown), unit, scale and offset. Raises ValueError with a reason."""
     path = str(term.get("class_type", ""))
     kind = re.split(r"[.:]", path)[-1]
     if kind not in KINDS:
@@ -129,7 +129,7 @@ def _init_state(env: Mapping[str, Any], asset: str) -> Mapping[str, Any]:
 
 
 def _joints(patterns: Sequence[str], state: Mapping[str, Any], size: int | None, notes: list[str]) -> list[str]:
-    """Return the joints' names in the action's order; empty where only the robot's file knows them.
+    """Return the joints' names in the action's order; empty if only the robot's file has them.
 
     Isaac Lab writes env.yaml in the order of its settings, so the initial state lists the joints as the robot has them;
     a file with sorted keys does not show.

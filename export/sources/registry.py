@@ -39,9 +39,9 @@ def sources(notify: Notify | None = None) -> list[Source]:
 
 
 def find_source(path: Path, name: str | None = None, notify: Notify | None = None) -> Source:
-    """Return the source called `name`, or the one that takes `path` for its own.
+    """Return the source called `name`, or the one that recognises `path`.
 
-    Raises UsageError for an unknown name, CheckpointError where no source or more than one knows the path.
+    Raises UsageError for an unknown name, CheckpointError if no source or more than one knows the path.
     """
     known = sources(notify)
     if name is not None:

@@ -64,4 +64,4 @@ class RestoredPolicy:
     elements: ElementNames | None = None
     """Names of its elements in the checkpoint; None if the environment's class has them."""
     untrained_filter: str = ""
-    """Why the observation filter's statistics are not training's; '' if they are or there is no filter."""
+    """Reason why the observation filter's statistics are not training's; '' if they are or there is no filter."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MEMBERS = {"data", "policy.pth", "_stable_baselines3_version"}
 SERIALIZED = ":serialized:"
 LOADED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
-"""The pickles in the zip that acting needs."""
+"""The zip's pickles that acting needs."""
 HARMLESS: dict[str, Any] = {
     "learning_rate": 0.0, "clip_range": 0.2, "train_freq": 1, "buffer_size": 1, "n_steps": 1, "n_envs": 1,
     "target_entropy": 0.0, "seed": None, "optimize_memory_usage": False, "replay_buffer_kwargs": {},

@@ -46,7 +46,7 @@ class Layout:
     """Steps from an environment's observation to the model's."""
 
     frame: Any
-    """The space of what the environment gives: one frame, images as they are there."""
+    """The environment's own observation space: one frame, images in its layout."""
     frames: int
     normalized_first: bool
     """Whether VecNormalize comes before the frames are stacked."""
@@ -287,7 +287,7 @@ def _rows(obs: Tree, rows: slice) -> Tree:
 
 
 def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
-    """Return how one frame of the environment becomes the model's observation.
+    """Return the steps from one frame of the environment to the model's observation.
 
     VecNormalize's own space says whether it comes before the stack, and of images whether their channels are last.
     Raises CheckpointError if the statistics or the number of frames do not fit the model.
@@ -344,7 +344,7 @@ def _leaf(key: str) -> str:
 
 
 def _fits(part: Sequence[int], whole: Sequence[int], axis: int) -> bool:
-    """Return whether `whole` is some `part`s side by side on one axis."""
+    """Return whether `whole` consists of several `part`s side by side on one axis."""
     if len(part) != len(whole) or not part or whole[axis] % part[axis]:
         return False
     rest, others = list(part), list(whole)

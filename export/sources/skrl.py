@@ -179,7 +179,7 @@ def _unbounded(size: int) -> Box:
 
 
 def _scaled(weights: Mapping[str, Any], name: str) -> int | None:
-    """Return how many elements a preprocessor scales."""
+    """Return the number of elements that a preprocessor scales."""
     mean = (weights.get(name) or {}).get("running_mean")
     return None if mean is None else int(mean.shape[0])
 
@@ -206,7 +206,7 @@ def _agent(file: Path, config: Mapping[str, Any], spaces: tuple[Any, Any, Any]) 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep skrl from printing models and seeds, and the random numbers of others as they were."""
+    """Keep skrl from printing models and seeds and from changing others' random numbers."""
     import torch
 
     logger = logging.getLogger("skrl")

@@ -152,9 +152,7 @@ def _check_spaces(spec: ModuleSpec) -> None:
                          "MultiDiscrete")  # fmt: skip
     for name, space in (*space_leaves(spec.observation_space, "obs").items(), ("action", spec.action_space)):
         if isinstance(space, Box) and np.dtype(space.dtype).kind == "f" and space.dtype not in (np.float32, np.float64):
-            raise UsageError(
-                f"{name}: {space} is not exported: only float32 and float64 are, of floating-point numbers"
-            )
+            raise UsageError(f"{name}: {space} is not exported: of floating-point spaces only float32 and float64 are")
     for name, space, elements in (
         ("observation", spec.observation_space, spec.elements.observation),
         ("action", spec.action_space, spec.elements.action),

@@ -20,25 +20,25 @@ TIMEOUT_S = 90.0  # every replica loads and proves a version before the server a
 
 
 class AdminClient(Closeable):
-    """Changes what a server serves. Every method raises the error that the server names."""
+    """Changes a server's plan. Every method raises the server's error."""
 
     def __init__(self, url: str, *, api_key: str, timeout_s: float = TIMEOUT_S) -> None:
-        """Nothing is sent before the first call."""
+        """Send nothing before the first call."""
         # Not retried: a change that was made and not answered would be made twice.
         self._transport = Transport(url, timeout_s=timeout_s, retries=0, api_key=api_key)
 
     def replicas(self) -> list[dict[str, Any]]:
-        """Return what every replica serves, as its `GET /v1/policies` would."""
+        """Return every replica's listing, as its `GET /v1/policies` would."""
         listings: list[dict[str, Any]] = self._transport.get("v1", "admin", "policies")
         return listings
 
     def listing(self) -> dict[str, Any]:
-        """Return what the process that answers serves, as `GET /v1/policies`."""
+        """Return the answering process's listing, as `GET /v1/policies`."""
         listing: dict[str, Any] = self._transport.get("v1", "policies", timeout_s=LOOK_TIMEOUT_S)
         return listing
 
     def metrics(self) -> str:
-        """Return the metrics as Prometheus reads them."""
+        """Return the metrics in Prometheus' format."""
         return self._transport.get_text("metrics", timeout_s=LOOK_TIMEOUT_S)
 
     def plans(self) -> dict[str, int]:
@@ -55,7 +55,7 @@ class AdminClient(Closeable):
         return self.command(name, "unload", {"version": version})
 
     def alias(self, name: str, alias: str, version: str | None, *, expected: str | None = None) -> dict[str, Any]:
-        """Let an alias lead to a loaded version, or with None remove it; unless it no longer leads to `expected`."""
+        """Point an alias to a loaded version, or with None remove it; unless it no longer points to `expected`."""
         return self.command(name, "alias", {"alias": alias, "version": version, "expected": expected})
 
     def rollback(self, name: str, alias: str) -> dict[str, Any]:
@@ -67,7 +67,7 @@ class AdminClient(Closeable):
         return self.command(name, "canary", {"version": version, "share": share})
 
     def shadow(self, name: str, version: str | None) -> dict[str, Any]:
-        """Let a version compute along, or with None end that."""
+        """Run a version as shadow, or with None end that."""
         return self.command(name, "shadow", {"version": version})
 
     def close(self) -> None:
@@ -75,7 +75,7 @@ class AdminClient(Closeable):
         self._transport.close()
 
     def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
-        """Give a command (`load`, `unload`, `alias`, `rollback`, `canary`, `shadow`); return what is served then."""
+        """Send a command (`load`, `unload`, `alias`, `rollback`, `canary`, `shadow`); return the new listing."""
         reply: dict[str, Any] = self._transport.post("v1", "admin", "policies", name, command, body=encode(document))
         return reply
 

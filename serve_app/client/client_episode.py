@@ -12,7 +12,7 @@ from rlservo.serve_app.client.replies import check_step, is_action, next_state
 
 
 class ClientEpisode:
-    """One episode after another, and what of it a request carries.
+    """Episodes of a client, and a request's fields on them.
 
     The recurrent state is here and travels with every request, or with `server_state` it stays with the server: in a
     session of this client, or on a stream with the connection. The server needs the last action if it limits the
@@ -44,7 +44,7 @@ class ClientEpisode:
         return not self.is_on_server(contract) and (bool(contract.state) or self._is_limited)
 
     def is_bound(self, contract: Contract) -> bool:
-        """Return whether what the episode remembers is of this policy's version."""
+        """Return whether the episode's memory is of this policy's version."""
         return bool(contract.state) and self._steps > 0
 
     def carry(self) -> None:
@@ -52,11 +52,11 @@ class ClientEpisode:
         self._is_limited = True
 
     def set_last_action(self, action: Any) -> None:
-        """Take note of what the robot was commanded instead of the server's action."""
+        """Note the robot's command instead of the server's action."""
         self._last_action, self._is_last_action_known = action, False
 
     def reconnect(self) -> None:
-        """Take note of a new connection, which knows nothing of the episode."""
+        """Note a new connection, which does not know the episode."""
         self._is_last_action_known = False
         self._is_lost = self._steps > 0
 
@@ -100,13 +100,13 @@ class ClientEpisode:
         return fields
 
     def end(self) -> None:
-        """Take note that the server knows of the episode's end: the next one has a session of its own."""
+        """Note that the server knows the episode's end: the next one has its own session."""
         self.reset()
         if self._session_id is not None:
             self._session_id = uuid.uuid4().hex
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
-        """Continue to the next step after a reply; `action` is the reply's, in the form in which it would be sent.
+        """Continue to the next step after a reply; `action` is the reply's, as it would be sent.
 
         Raises SessionLostError when the reply is of another episode, UnavailableError when it lacks the state.
         """

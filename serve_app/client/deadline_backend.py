@@ -16,7 +16,7 @@ from typing import Any
 import httpcore
 
 MOST_HELD = 65536
-"""[bytes] of a request that are held until all of it is there."""
+"""[bytes] Part of a request that is held back until it is complete."""
 
 
 class DeadlineBackend(httpcore.NetworkBackend):
@@ -29,7 +29,7 @@ class DeadlineBackend(httpcore.NetworkBackend):
 
     @property
     def deadline(self) -> float | None:
-        """When this thread's exchange must be over (`time.monotonic`); None leaves httpcore's own time-outs."""
+        """End of this thread's exchange (`time.monotonic`); None leaves httpcore's own time-outs."""
         return getattr(self._local, "deadline", None)
 
     @deadline.setter
@@ -37,7 +37,7 @@ class DeadlineBackend(httpcore.NetworkBackend):
         self._local.deadline = value
 
     def remaining(self, timeout: float | None, kind: type[Exception]) -> float | None:
-        """Return what is left of `timeout` and the deadline; raise `kind` if that is nothing."""
+        """Return the time left of `timeout` and the deadline; raise `kind` if there is none."""
         if self.deadline is None:
             return timeout
         remaining_s = self.deadline - time.monotonic()

@@ -96,7 +96,7 @@ class Transport:
         self._pool = _connection_pool(self.url, self._backend, proxy)
         self._is_closed = False
         self.label: str | None = None
-        """Whose requests the following are, for the server's recording."""
+        """Label of the following requests, for the server's recording."""
 
     @property
     def reconnects(self) -> int:
@@ -245,7 +245,7 @@ def _retry_after_s(headers: Headers) -> float | None:
 
 
 def _connection_pool(url: str, backend: DeadlineBackend, proxy: str | None) -> httpcore.ConnectionPool:
-    """Return the connections to a server, through the proxy that the environment asks for."""
+    """Return the connections to a server, through the environment's proxy."""
     # Reading the certificates takes 20 ms; http has no use for them.
     certificates = _certificates() if url.startswith("https") else None
     options: dict[str, Any] = {
@@ -261,7 +261,7 @@ def _connection_pool(url: str, backend: DeadlineBackend, proxy: str | None) -> h
     address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
     if parts.scheme not in PROXIES:
         raise UsageError(
-            f"a proxy in the environment variables begins with {parts.scheme!r}: expected for example 'http://proxy:3128'"
+            f"a proxy in the environment variables begins with {parts.scheme!r}: expected an address such as 'http://proxy:3128'"
         )
     return PROXIES[parts.scheme](address, user, **options)
 
@@ -281,7 +281,7 @@ def _host_header(parts: SplitResult) -> bytes:
 
 
 def _proxy_of(url: str) -> str | None:
-    """Return the proxy that HTTP_PROXY, HTTPS_PROXY and NO_PROXY ask for; none for the server on this very machine."""
+    """Return the proxy of HTTP_PROXY, HTTPS_PROXY and NO_PROXY; none for a server on this machine."""
     parts = urlsplit(url)
     if parts.hostname in LOOPBACK or proxy_bypass(parts.netloc):
         return None

@@ -15,7 +15,7 @@ from rlservo.serve_app.interface import Observation
 
 
 def encode_observation(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
-    """Return (what is sent, the batch axis as () or (B,)); the server checks shapes and names."""
+    """Return (the encoded observation, the batch axis as () or (B,)); the server checks shapes and names."""
     space = contract.observation_space
     if isinstance(space, DictSpec | TupleSpec):
         return _encode_part(obs, space, "obs")

@@ -29,7 +29,7 @@ EXIT_CODES = {PROMOTED: 0, ROLLED_BACK: 1, STOPPED: 4, INTERRUPTED: 130}  # 2 is
 
 @dataclass(frozen=True)
 class Terms:
-    """Everything a promotion was asked to do; the same terms are the same promotion."""
+    """Terms of a promotion; the same terms are the same promotion."""
 
     urls: tuple[str, ...]  # commands go to the first, metrics are read from all
     policy: str
@@ -46,7 +46,7 @@ class Outcome:
     outcome: str
     why: str
     is_finished: bool = True
-    """Whether the server is as it says; if not, the same promotion started again continues."""
+    """Whether the server's plan matches the outcome; if not, the same promotion started again continues."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class Promotion:
     # Begin, or continue.
 
     def _begin(self) -> None:
-        """Check what is served, and count from here on."""
+        """Check the server's plan, and count from here on."""
         terms, served = self._terms, self._served()
         name, version = terms.policy, terms.version
         if served is None:
@@ -170,7 +170,7 @@ class Promotion:
         return None
 
     def _resume(self) -> Outcome | None:
-        """Read what the log's promotion has come to; return the outcome if that was decided."""
+        """Read the state of the log's promotion; return the outcome if it was decided."""
         start, decision = self._log.entries[START], self._log.entries.get(DECISION)
         if start.get("terms") != json.loads(json.dumps(asdict(self._terms))):
             raise UsageError(
@@ -218,7 +218,7 @@ class Promotion:
                 self._say(f"cannot judge: {trouble}")
 
     def _behind(self, processes: dict[str, Process]) -> str:
-        """Return which process does not serve what is watched, in a sentence."""
+        """Return a sentence on a process that does not serve the watched versions."""
         for name, process in processes.items():
             if process.plan < self._generation:
                 return f"replica '{name}' follows plan {process.plan:g}, not yet {self._generation}"
@@ -227,7 +227,7 @@ class Promotion:
         return ""
 
     def _judge(self) -> Outcome | None:
-        """Write down what was counted; return the outcome if there is one."""
+        """Log the counts; return the outcome if there is one."""
         terms, remaining = self._terms, self._remaining
         found = list(figures(terms.limits, self._counts.total, self._production, terms.version))
         surely, all_of_it = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
@@ -259,7 +259,7 @@ class Promotion:
     # Carry out what was decided.
 
     def _carry_out(self, outcome: Outcome, decided_at: int | None) -> Outcome:
-        """Move the alias or not, and end the canary; return the outcome with what is served then."""
+        """Move the alias or not, and end the canary; return the outcome with the new listing."""
         deadline = self._clock() + PATIENCE_S
         while True:
             try:

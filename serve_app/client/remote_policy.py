@@ -75,9 +75,9 @@ class RemotePolicy(ActingPolicy):
         self._episode = episode
         self._contract: Contract | None = None
         self._looks_up = False
-        """Whether the contract is fetched again before the next request: of an alias, which may lead elsewhere."""
+        """Whether the contract is fetched again before the next request: of an alias, which may have moved."""
         self._contracts: dict[str, Contract] = {}
-        """Of every version that was met."""
+        """Contracts of every version that has answered."""
         self._reward: float | None = None
         """Result of the last action, for the next request."""
         self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
@@ -147,7 +147,7 @@ class RemotePolicy(ActingPolicy):
         self._episode.end()
 
     def set_last_action(self, action: Any) -> None:
-        """Take note of what the robot was commanded instead of an answer that did not come. Sends nothing.
+        """Note the robot's command instead of a missing answer. Sends nothing.
 
         The next request says so, and a limit on the step from one action to the next (`max_action_step`) counts from
         there. `action` is as `act` returns it.
@@ -164,7 +164,7 @@ class RemotePolicy(ActingPolicy):
             self._recording.begin()
 
     def close(self) -> None:
-        """End the recording and close what is open to the server; later calls raise UsageError."""
+        """End the recording and close the connections to the server; later calls raise UsageError."""
         if self._recording is not None:
             self._recording.end()
         self._close()
@@ -172,8 +172,8 @@ class RemotePolicy(ActingPolicy):
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Return as soon as the server offers the policy.
 
-        Raises UnavailableError with the last reason after `timeout_s`, and at once what waiting cannot cure, such as
-        UnknownPolicyError.
+        Raises UnavailableError with the last reason after `timeout_s`, and at once errors that waiting cannot cure,
+        such as UnknownPolicyError.
         """
         deadline = time.monotonic() + timeout_s
         while self._contract is None:
@@ -199,7 +199,7 @@ class RemotePolicy(ActingPolicy):
 
     @abstractmethod
     def _close(self) -> None:
-        """Close what is open to the server; harmless when repeated."""
+        """Close the connections to the server; harmless when repeated."""
         ...
 
     @abstractmethod
@@ -213,7 +213,7 @@ class RemotePolicy(ActingPolicy):
         ...
 
     def _meet(self, contract: Contract) -> None:
-        """Take this contract for that of the version that answers from now on. Raises UnavailableError."""
+        """Use this contract for the version that answers from now on. Raises UnavailableError."""
         self._learn(contract)
         if self._contract is not None and contract is not self._contract:
             check_successor(contract, self._contract)
@@ -257,7 +257,7 @@ class RemotePolicy(ActingPolicy):
         return known
 
     def _fetch_new_version(self, version: str, deadline: float) -> Contract:
-        """Return the contract of a version that has answered, also where another process does not serve it yet."""
+        """Return the contract of a version that has answered, even if another process does not serve it yet."""
         until = min(deadline, time.monotonic() + FOLLOWED_S)
         while True:
             try:
@@ -270,7 +270,7 @@ class RemotePolicy(ActingPolicy):
     def _encode_request(
         self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None
     ) -> tuple[dict[str, Any], tuple[int, ...]]:
-        """Return (the arguments of `act` as a request has them, the batch axis as () or (B,))."""
+        """Return (the arguments of `act` as request fields, the batch axis as () or (B,))."""
         encoded, batch = encode_observation(obs, self.contract)
         request: dict[str, Any] = {"obs": encoded}
         if explore:

@@ -59,7 +59,7 @@ def excerpt(content: bytes) -> str:
 
 
 def _classes() -> dict[str, type[RlservoError]]:
-    """Return every error class by its code, as the wire names it."""
+    """Return every error class by its code."""
     classes: dict[str, type[RlservoError]] = {}
     queue: list[type[RlservoError]] = [RlservoError]
     while queue:
@@ -81,7 +81,7 @@ def _class_of_status(status: int) -> type[RlservoError]:
 
 
 def answering_version(url: str, reply: Any, number: int, contract: Contract) -> str:
-    """Return which version answered; refuse an answer to another request or from another policy."""
+    """Return the version that answered; refuse an answer to another request or from another policy."""
     if not isinstance(reply, dict):
         raise UnavailableError(f"{url} answered with {type(reply).__name__}, expected an object")
     if reply.get("seq") != number:

@@ -1,7 +1,7 @@
 """`StreamClient`: a policy on a server over one WebSocket, used like `PolicyClient`.
 
-A stream saves the HTTP around each request. It is made again by itself when it breaks, and whatever comes late is known
-by its number and never used.
+A stream saves the HTTP around each request. It reconnects automatically when it breaks, and whatever comes late is
+known by its number and never used.
 """
 
 from __future__ import annotations
@@ -242,7 +242,7 @@ class StreamClient(RemotePolicy):
 
 
 class _UnmetVersionError(UnavailableError):
-    """A version answered whose contract did not come on any connection yet."""
+    """A version answered whose contract has not arrived on any connection yet."""
 
 
 def _first_of_chunk(chunks: Any, contract: Contract, batch: tuple[int, ...]) -> Any:

@@ -74,9 +74,9 @@ class WebSocket:
             raise
         response, *self._events = self._protocol.events_received()
         self.headers = cast("Response", response).headers
-        """Of the handshake's response."""
+        """Headers of the handshake's response."""
         self.last_receive_at = time.monotonic()
-        """When the server's last bytes came."""
+        """Time of the server's last bytes."""
 
     def send(self, content: bytes, deadline: float) -> None:
         """Send one binary frame. Raises BrokenError or DeadlineError; the connection is then closed."""
@@ -116,7 +116,7 @@ class WebSocket:
                 raise BrokenError(f"{self._url} closed the connection (code {code})")
 
     def close(self) -> None:
-        """Close, telling the server if it takes no time."""
+        """Close, with a close frame if that takes no time."""
         with contextlib.suppress(Exception):
             self._protocol.send_close(1000)
             self._flush(time.monotonic() + 0.05)

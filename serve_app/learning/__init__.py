@@ -1,1 +1,1 @@
-"""Learning from recordings: recorded episodes as RLlib's own, and the loop that trains what robots are served."""
+"""Learning from recordings: recorded episodes as RLlib's own, and the loop that trains a served policy."""

@@ -1,6 +1,6 @@
-"""Admission of recorded episodes to learning: of a known version, whole, explored, and what the contract allows.
+"""Admission of recorded episodes to learning: of a known version, whole, explored, and within the contract.
 
-What is not admitted is dropped with a reason, and counted by it. Nothing a client sends can pass for an action of the
+Others are dropped with a reason, and counted by it. Nothing a client sends can pass for an action of the
 policy's: the server records what it drew, and the graph and contract it drew from must be those that this run made.
 """
 
@@ -21,7 +21,7 @@ from rlservo.serve_app.recording.episodes import Columns, Episode
 from rlservo.serve_app.recording.own_actions import is_sent_as
 
 LOGP_TOLERANCE = 1e-4
-"""Of a recorded log-probability from that of its own distribution: both come from the same recorded float32."""
+"""Tolerance of a recorded log-probability against its own distribution's: both come from the same recorded float32."""
 
 Reward: TypeAlias = Callable[[Any, Any, Any], float]
 """The reward of an action: `reward(obs, action, next_obs)`, each in its space's own form."""
@@ -75,7 +75,7 @@ class Admission:
 
 
 def _why_not_drawn(episode: Episode) -> str | None:
-    """Return what makes an episode's actions other than the policy's own draws, from observations that it takes."""
+    """Return the reason why an episode's actions are not the policy's own draws from its observations."""
     if not episode.explored.all():
         return "in which not every action explored"
     if not episode.acted.all() or episode.fell_back.any():
@@ -92,7 +92,7 @@ def _why_not_drawn(episode: Episode) -> str | None:
 
 
 def _why_not_sent(episode: Episode) -> str | None:
-    """Return what is wrong with the actions that were sent. A limit on the step may have changed them: it is the
+    """Return the fault of the sent actions. A limit on the step may have changed them: it is the
     environment's part, as clipping is, and the own action is learned.
     """
     contract = episode.policy.contract
@@ -108,7 +108,7 @@ def _why_not_sent(episode: Episode) -> str | None:
 
 
 def _rewards(episode: Episode, reward: Reward) -> NDArray[np.float64]:
-    """Return what each action brought by the user's function; the last one needs the observation after it."""
+    """Return each action's reward by the user's function; the last one needs the observation after it."""
     contract = episode.policy.contract
     final: Columns | None = episode.final_obs
     if final is None:

@@ -18,7 +18,7 @@ from rlservo.serve_app.recording.recorder import FILE_NAME, SUFFIX
 
 @dataclass(frozen=True)
 class Ended:
-    """An episode that has ended, or a piece that no more will come of, and its name in the learner's books."""
+    """An episode that has ended, or a piece without continuation, and its key in the learner's state."""
 
     file: str
     """The file that holds its end."""
@@ -42,7 +42,7 @@ class FollowedRecordings:
         self._writers: dict[str, EpisodeAssembler] = {}
 
     def names(self) -> set[str]:
-        """Return the names of the files that are there."""
+        """Return the names of the present files."""
         return {str(path) for path in self._paths()}
 
     def poll(self) -> Iterator[Ended]:
@@ -79,5 +79,5 @@ class FollowedRecordings:
 
 
 def _writer_of(path: Path) -> str:
-    """Return what the files of one process have in common: an episode may continue in its next file."""
+    """Return the common part of the names of one process's files: an episode may continue in its next file."""
     return str(path.with_name(path.name.rpartition("-")[0])) if FILE_NAME.match(path.name) else str(path)

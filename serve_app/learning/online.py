@@ -67,7 +67,7 @@ class OnlineLearning:
         self._source = self._admitted()
 
     def run(self, versions: int | None = None) -> None:
-        """Learn until so many further versions were released, or interrupted. Raises RlservoError."""
+        """Learn until this number of further versions was released, or interrupted. Raises RlservoError."""
         state = self._run.state
         if self._run.is_new:
             self._begin()
@@ -91,7 +91,7 @@ class OnlineLearning:
         self._say(f"version {known.version} is the checkpoint itself")
 
     def _make_version(self) -> bool:
-        """Release what was learned; return whether the gate let it pass. If not, learn on from the last version."""
+        """Release the learned version; return whether the gate passed it. If not, continue from the last version."""
         state = self._run.state
         try:
             known = self._release.publish(self._learner.save)
@@ -168,7 +168,7 @@ class OnlineLearning:
         return batch
 
     def _admitted(self) -> Iterator[Admitted | str | None]:
-        """Yield an episode to learn from, or why it is not; None where no more have ended yet."""
+        """Yield an episode, or the reason against it; None if no more have ended yet."""
         state = self._run.state
         while True:
             for ended in self._recordings.poll():

@@ -1,4 +1,4 @@
-"""Release of a version to a server: proven, published, loaded, and led to by an alias."""
+"""Release of a version to a server: proven, published, loaded, and named by an alias."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Release:
         progress: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`connect` makes a client with the admin key as it is then; `progress` takes what is waited for."""
+        """`connect` makes a client with the admin key as it is then; `progress` takes the current activity."""
         self._target, self._run, self._connect = target, run, connect
         self._app_dir, self._progress, self._sleep = app_dir, progress, sleep
 
@@ -75,9 +75,9 @@ class Release:
         raise UsageError(f"{place}/{name}: others keep publishing versions; give the same command again")
 
     def serve(self, version: str, before: str | None) -> None:
-        """Let the server load a version and the alias lead to it; done already, it changes nothing.
+        """Let the server load a version and point the alias to it; a repetition changes nothing.
 
-        `before` is where this run has let the alias lead, None at its first version. Raises ConflictError where
+        `before` is this run's last target of the alias, None at its first version. Raises ConflictError where
         someone else has moved it.
         """
         name, alias = self._target.policy, self._target.alias
@@ -85,7 +85,7 @@ class Release:
         self._until_reached(lambda: self._move(name, alias, version, before))
 
     def unload(self, version: str) -> None:
-        """Let the server drop a version that no robot is to ask for any more, unless something still leads to it."""
+        """Let the server unload a version that robots no longer need, unless something still points to it."""
         try:
             with self._connect() as client:
                 client.unload(self._target.policy, version)
@@ -110,7 +110,7 @@ class Release:
             client.alias(name, alias, version, expected=there)
 
     def _until_reached(self, change: Callable[[], Result]) -> Result:
-        """Return what `change` returns, tried until the server or the storage is reachable."""
+        """Return the result of `change`, tried until the server or the storage is reachable."""
         while True:
             try:
                 return change()

@@ -26,7 +26,7 @@ from rlservo.serve_app.recording.reader import Recording
 
 AT_ONCE = 256  # episodes in a pipeline's pass
 CANNOT_LEARN = ("FrameStacking",)
-"""Pieces that put nothing into the episode: a learner would need a second one of its own."""
+"""Pieces that add nothing to the episode: a learner would need a second one."""
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Recorded:
     inverted: int = 0
     """Decisions whose own action is the inverse of the executed one."""
     clipped: int = 0
-    """Of those, how many lie at a bound, or anywhere beyond it."""
+    """Number of those at a bound, or anywhere beyond it."""
 
     @property
     def decisions(self) -> int:
@@ -56,22 +56,22 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Choice:
-    """Which episodes are learned from, and what of them is learned."""
+    """Choice of episodes, and of the actions learned from them."""
 
     rewards: bool = True
     """Whether the learner needs rewards, and the observation after an episode that was cut off."""
     status: str | None = None
-    """Only episodes that ended so."""
+    """Only episodes with this final status."""
     modes: bool = False
     """Whether the most likely action of a recorded distribution is learned, not the one that was drawn."""
     ahead: int = 0
-    """Learn for an observation what was done so many cycles later."""
+    """Learn for an observation the action of this many cycles later."""
 
 
 def read_recordings(recording: Recording, choice: Choice | None = None, *, name: str | None = None) -> Recorded:
     """Return the whole episodes of one policy that can be learned from.
 
-    Raises UsageError where none can be used, and RecordingError.
+    Raises UsageError if none can be used, and RecordingError.
     """
     chosen = choice or Choice()
     recorded: Recorded | None = None

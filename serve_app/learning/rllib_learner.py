@@ -30,7 +30,7 @@ LEARNER_GROUP = "learner_group"
 
 
 class OnlineLearner:
-    """The learner, as it is after the updates so far."""
+    """The learner after the updates so far."""
 
     def __init__(self, start: Path, *, batch_size: int | None = None) -> None:
         """Restore the checkpoint `start`; `batch_size` is the steps of an update, else the checkpoint's own.

@@ -79,7 +79,7 @@ class RunFolder(Closeable):
         return self.path / "checkpoints" / version
 
     def begin(self, name: str, version: str) -> Path:
-        """Return the folder for a new version's checkpoint, and remove what a killed process left of it."""
+        """Return the folder for a new version's checkpoint, and remove a killed process's remains."""
         shutil.rmtree(self.checkpoint(version), ignore_errors=True)
         shutil.rmtree(self.bundles / name / version, ignore_errors=True)
         self.checkpoint(version).parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +101,7 @@ class RunFolder(Closeable):
         os.close(self._lock)
 
     def _check_ours(self) -> None:
-        """Raise UsageError for a folder that holds anything that no run makes."""
+        """Raise UsageError for a folder with other content than a run's."""
         ours = {LOCK_FILE, REWARD_FILE, STATE_FILE, f"{STATE_FILE}.part", "bundles", "checkpoints"}
         others = sorted({entry.name for entry in self.path.iterdir()} - ours)
         if others:

@@ -1,1 +1,1 @@
-"""Flight recorder: decisions of policies written to MCAP files alongside the loop, read back, shown and converted."""
+"""Recorder: decisions of policies in MCAP files, written alongside the loop, read back, shown and converted."""

@@ -26,9 +26,9 @@ from rlservo.serve_app.recording.reader import Recording
 
 @contextmanager
 def new_path(out: Path) -> Iterator[Path]:
-    """Yield where to write a file or folder that becomes `out` at the end, and is removed where something fails.
+    """Yield a temporary path that becomes `out` at the end, and is removed on failure.
 
-    Raises UsageError where `out` exists, unless as an empty folder.
+    Raises UsageError if `out` exists, unless as an empty folder.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists: give a new path")

@@ -51,12 +51,12 @@ class Episode:
 
     @cached_property
     def steps(self) -> NDArray[np.int64]:
-        """Which decision of the episode each is, from 0."""
+        """Number of each decision in the episode, from 0."""
         return np.array([one["step"] for one in self._decisions], np.int64)
 
     @property
     def gap(self) -> int | None:
-        """Return the first row before which decisions are missing; None if there are all."""
+        """Return the first row before which decisions are missing; None if all are present."""
         expected = self.steps[0] + np.arange(len(self)) if self.id else self.steps
         if self.id and not self.begins and self.steps[0] == 0:
             return 0
@@ -65,7 +65,7 @@ class Episode:
 
     @cached_property
     def time_s(self) -> NDArray[np.float64]:
-        """When each decision was made [s since 1970], by a clock that never jumps."""
+        """Time of each decision [s since 1970], by a clock that never jumps."""
         return np.array(self._log_times_ns, np.float64) / 1e9
 
     @cached_property
@@ -95,7 +95,7 @@ class Episode:
 
     @cached_property
     def executed(self) -> Columns:
-        """The actions that the robot was commanded: the policy's, or what stood in for it."""
+        """The robot's commands: the policy's actions, or their replacements."""
         commands = self._commands()
         return self.policy.actions.columns(
             [
@@ -135,7 +135,7 @@ class Episode:
 
     @cached_property
     def reward_input(self) -> NDArray[np.float64]:
-        """The reward that the policy was given to see; NaN if it was given none."""
+        """The policy's reward input; NaN if there was none."""
         return self._numbers("reward_input")
 
     @cached_property
@@ -164,12 +164,12 @@ class Episode:
 
     @property
     def warnings(self) -> list[tuple[int, str]]:
-        """Return (row, sentence) of everything that was warned of."""
+        """Return (row, sentence) of every warning."""
         return [(row, text) for row, one in enumerate(self._decisions) for text in one.get("warnings", ())]
 
     @property
     def errors(self) -> list[str | None]:
-        """Return for each row why there was no action; None if there was."""
+        """Return for each row the reason for a missing action; None if there was one."""
         return [one.get("error") for one in self._decisions]
 
     def field(self, name: str) -> list[Any]:
@@ -199,7 +199,7 @@ def episodes(recording: Recording) -> Iterator[Episode]:
 
 
 class EpisodeAssembler:
-    """Puts the messages of one writer together to episodes."""
+    """Assembles the messages of one writer into episodes."""
 
     def __init__(self) -> None:
         self.opened: OrderedDict[tuple[int, str], Episode] = OrderedDict()

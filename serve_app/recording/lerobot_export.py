@@ -42,7 +42,7 @@ def export_lerobot(
 ) -> tuple[int, int]:
     """Write the new folder `out` and return (episodes, frames).
 
-    Observations are `observation.state`, what the robot was commanded is `action`. Episodes with a gap, or with a step
+    Observations are `observation.state`, the robot's command is `action`. Episodes with a gap, or with a step
     without an action, are left out. Raises UsageError if nothing is left, and RecordingError.
     """
     pa = optional_package("pyarrow", "an export to LeRobot")

@@ -1,6 +1,6 @@
 """One MCAP file being written: channels, JSON messages, a chunk each flush.
 
-A file is readable to its last flush, whatever becomes of its writer. Times are two: a message's log time continues with
+A file is readable to its last flush, even if its writer is killed. Times are two: a message's log time continues with
 the monotonic clock from the file's start, so that plots never run backwards, and its publish time is the wall clock's.
 """
 
@@ -98,7 +98,7 @@ class LogFile:
         self._add_rows("decision", record, columns, _details(record))
 
     def add_outcome(self, record: OutcomeRecord) -> None:
-        """Write what came of a decision. Raises ValueError or RequestError if it does not fit."""
+        """Write the outcome of a decision. Raises ValueError or RequestError if it does not fit."""
         policy, columns = record.policy, []
         if record.reward is not None:
             columns.append(_rewards("reward", record.reward, record.rows))
@@ -133,14 +133,14 @@ class LogFile:
             self._stream.close()
 
     def abandon(self) -> None:
-        """Close without an index, where writing failed."""
+        """Close without an index, after a failed write."""
         with contextlib.suppress(OSError):  # it tries once more to write what it still holds
             self._stream.close()
 
     def _add_rows(
         self, kind: str, record: DecisionRecord | OutcomeRecord, columns: list[list[bytes]], shared: list[bytes]
     ) -> None:
-        """Write a message for each row, of its own members in `columns` and those that all rows share."""
+        """Write a message for each row: its own members in `columns` and the shared ones."""
         channel = self._channel(record.policy, kind)
         log_time = self._log_time(record.monotonic_ns)
         for row, members in enumerate(zip(*columns, strict=True) if columns else [()] * record.rows):

@@ -107,7 +107,7 @@ def _is_whole(episode: Episode) -> bool:
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let minari keep its datasets in `folder`: it reads the place from the environment alone."""
+    """Let minari keep its datasets in `folder`: it reads the place only from the environment."""
     before = os.environ.get(PATH_VARIABLE)
     os.environ[PATH_VARIABLE] = str(folder.resolve())
     try:

@@ -22,7 +22,7 @@ ROUNDING = 1e-5  # of a Box's span: an own action that is sent as what was execu
 
 @dataclass(frozen=True)
 class OwnActions:
-    """Own actions of an episode's decisions, of what the robot executed."""
+    """Own actions of an episode's executed decisions."""
 
     leaves: Columns
     """By tensor name, `[rows, *shape]`."""
@@ -35,7 +35,7 @@ class OwnActions:
 
 
 def own_actions(episode: Episode) -> OwnActions:
-    """Return the own action of every row, as far as it can be known."""
+    """Return the own action of every row, if it can be known."""
     contract = episode.policy.contract
     transform = transform_of(contract)
     specs = leaf_specs(contract.action_space, "action")
@@ -56,7 +56,7 @@ def own_actions(episode: Episode) -> OwnActions:
 
 
 def modes(episode: Episode) -> OwnActions:
-    """Return what the policy would have done had it not explored: its distributions' most likely actions.
+    """Return the policy's actions without exploring: its distributions' most likely ones.
 
     Rows that did not explore have their own action; no row is `known` that holds a fallback's.
     """

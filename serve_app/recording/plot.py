@@ -1,4 +1,4 @@
-"""Picture of a recorded episode: observations, actions, rewards, latency, and where something was wrong."""
+"""Picture of a recorded episode: observations, actions, rewards, latency and faults."""
 
 from __future__ import annotations
 

@@ -25,14 +25,14 @@ Leaves = Mapping[str, NDArray[Any]]
 
 
 class LeafArrays(dict[str, NDArray[Any]]):
-    """A value, or a batch of them, taken apart: arrays by tensor name, `[batch, *shape]`."""
+    """A value, or a batch of them, as arrays by tensor name, `[batch, *shape]`."""
 
 
 class PolicyFormat:
     """Format of one policy's decisions; one object per policy, version and graph."""
 
     def __init__(self, contract: Contract, *, graph_hash: str = "", options: Mapping[str, Any] | None = None) -> None:
-        """`graph_hash` is empty where only a server knows it; `options` are those of `PolicyOptions` that were set."""
+        """`graph_hash` is empty if only a server knows it; `options` are those of `PolicyOptions` that were set."""
         self.contract = contract
         self.graph_hash = graph_hash
         self.options = dict(options or {})
@@ -53,7 +53,7 @@ class PolicyFormat:
 
     @property
     def record_bytes(self) -> int:
-        """About how much memory one decision takes while it waits for the writer."""
+        """Approximate memory of one decision while it waits for the writer."""
         spaces = (self.contract.observation_space, self.contract.action_space)
         return 1000 + sum(
             leaf.size * np.dtype(leaf.dtype).itemsize for space in spaces for leaf in leaf_specs(space, "").values()
@@ -86,13 +86,13 @@ class SpaceFormat:
         return LeafArrays({name: self._formats[name].array(parts[name]) for name in self.leaves})
 
     def encode_rows(self, value: Any) -> list[bytes]:
-        """Return the JSON of each row of what `arrays` takes."""
+        """Return the JSON of each row of `arrays`' input."""
         parts = value if isinstance(value, LeafArrays) else self._parts(value)
         columns = [self._formats[name].encode_rows(parts[name]) for name in self.leaves]
         return columns[0] if self._is_leaf else [self._template % row for row in zip(*columns, strict=True)]
 
     def count_rows(self, value: Any) -> int:
-        """Return how many values an array, or a nest of arrays, holds."""
+        """Return the number of values in an array, or in nested arrays."""
         return max(1, _total_size(value) // sum(leaf.size for leaf in self.leaves.values()))
 
     def columns(self, documents: Sequence[Any]) -> dict[str, NDArray[Any]]:
@@ -166,7 +166,7 @@ def _children(space: SpaceSpec) -> list[tuple[str, SpaceSpec]]:
 
 
 class _LeafFormat:
-    """One array: an object by element name where all elements have one, else a flat array; a choice is a number."""
+    """One array: an object by element name if all elements have one, else a flat array; a choice is a number."""
 
     def __init__(self, path: str, leaf: LeafSpec) -> None:
         self._path, self._leaf = path, leaf
@@ -259,7 +259,7 @@ def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
 
 
 def outcome_schema(policy: PolicyFormat) -> dict[str, Any]:
-    """Return the JSON schema of what came of a policy's decisions."""
+    """Return the JSON schema of the outcomes of a policy's decisions."""
     return _object(
         f"Outcome of a decision of {policy.title}",
         {
@@ -303,7 +303,7 @@ DROPPED_SCHEMA: dict[str, Any] = {
 
 
 def element_differences(recorded: Contract, other: Contract) -> Iterator[str]:
-    """Yield a sentence for each difference between two contracts that keeps one from being fed the other's records."""
+    """Yield a sentence for each difference between two contracts that makes one's records unusable for the other."""
     for side, ours, theirs in (
         ("observation", recorded.observation_space, other.observation_space),
         ("action", recorded.action_space, other.action_space),

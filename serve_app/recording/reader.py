@@ -36,7 +36,7 @@ class RecordingError(RlservoError):
 
 @dataclass(slots=True)
 class Entry:
-    """One message: a decision of a policy, or what came of one."""
+    """One message: a decision of a policy, or its outcome."""
 
     policy: PolicyFormat
     kind: str  # decision or outcome
@@ -80,9 +80,9 @@ class Recording:
         if missing is not None:
             raise RecordingError(f"{missing} does not exist, or is not a file")
         self.files: list[FileFacts] = []
-        """Of the files that were read so far."""
+        """Facts of the files that were read so far."""
         self.policies: list[PolicyFormat] = []
-        """Those that were met so far; the same one for the same policy of several files."""
+        """Policies that were met so far; the same object for the same policy of several files."""
 
     def entries(self) -> Iterator[Entry]:
         """Yield every decision and outcome, in the order they were written.
@@ -96,7 +96,7 @@ class Recording:
             yield from FileReader(self, facts).entries()
 
     def known(self, policy: PolicyFormat) -> PolicyFormat:
-        """Return the one object that stands for this policy."""
+        """Return the object of this policy."""
         for known in self.policies:
             if known.key == policy.key:
                 return known
@@ -144,7 +144,7 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
 
 
 class FileReader:
-    """One pass over one file, in as many calls of `entries` as its writer adds to it."""
+    """One pass over one file, in one call of `entries` for each addition by its writer."""
 
     def __init__(self, recording: Recording, facts: FileFacts) -> None:
         self._recording = recording
@@ -155,7 +155,7 @@ class FileReader:
         self._offset_ns: int | None = None
 
     def entries(self) -> Iterator[Entry]:
-        """Yield what the file holds beyond what was yielded before. Raises RecordingError."""
+        """Yield the file's content after the last yield. Raises RecordingError."""
         for record in read_records(self._facts):
             try:
                 entry = self._take(record)

@@ -20,7 +20,7 @@ from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 
 
 class WithRecording(ActingPolicy):
-    """A policy that records what it sees and does; `outcome` adds what only the control loop knows.
+    """A policy that records its observations and actions; `outcome` adds the control loop's knowledge.
 
     ```python
     with WithRecording(Policy.load("policies/ur5"), "run.mcap") as policy:
@@ -41,7 +41,7 @@ class WithRecording(ActingPolicy):
         wait: bool = False,
         act: Callable[..., Any] | None = None,
     ) -> None:
-        """Record to the new file `record` (.mcap), into the folder `record`, or with a Recorder that is there already.
+        """Record to the new file `record` (.mcap), into the folder `record`, or with an existing Recorder.
 
         `wait` is the Recorder's; `act` replaces `policy.act` if a policy records itself.
         """
@@ -109,7 +109,7 @@ class WithRecording(ActingPolicy):
         final_status: str | None = None,
         final_obs: Observation | None = None,
     ) -> None:
-        """Record what the last action brought and whether the episode ended with it, and pass it on to a client.
+        """Record the last action's reward and whether the episode ended with it, and pass it on to a client.
 
         `final_obs` is the observation after an episode's last action. Nothing to do before the first action.
         """
@@ -130,7 +130,7 @@ class WithRecording(ActingPolicy):
         final_status: str | None,
         final_obs: Observation | None,
     ) -> None:
-        """Record what the last action brought, without passing it on."""
+        """Record the last action's outcome, without passing it on."""
         self._add_outcome(
             reward=None if reward is None else float(reward),
             terminated=bool(terminated),
@@ -140,22 +140,22 @@ class WithRecording(ActingPolicy):
         )
 
     def set_last_action(self, action: Any) -> None:
-        """Record what the robot was commanded instead of the last action, and pass it on to a client."""
+        """Record the robot's command instead of the last action, and pass it on to a client."""
         self.record_command(action)
         pass_on = getattr(self._policy, "set_last_action", None)
         if pass_on is not None:
             pass_on(action)
 
     def record_command(self, action: Any) -> None:
-        """Record what the robot was commanded instead of the last action, without passing it on."""
+        """Record the robot's command instead of the last action, without passing it on."""
         self._add_outcome(commanded=_copy(action))
 
     def begin(self) -> None:
-        """Begin an episode of the recording, and of nothing else."""
+        """Begin an episode of the recording only."""
         self._episode, self._step = uuid.uuid4().hex[:16], 0
 
     def end(self) -> None:
-        """End the recording, and nothing else; a Recorder that was given continues."""
+        """End only the recording; a Recorder that was given continues."""
         if self._own is not None:
             self._own.close()
 

@@ -1,4 +1,4 @@
-"""Recorder: a bounded buffer on the hot path, and a thread that writes what is in it to MCAP files.
+"""Recorder: a bounded buffer on the hot path, and a thread that writes it to MCAP files.
 
 Recording never gets in the way of acting: `record` takes a microsecond and raises nothing, what does not fit into the
 buffer is dropped and counted (and the file marks where), and when a file cannot be written recording ends with one
@@ -84,7 +84,7 @@ class Recorder(Closeable):
         """Records that did not fit into the buffer, or came after recording had ended."""
         self.written = 0
         self.failure: str | None = None
-        """Why recording has ended, if it could not continue."""
+        """Reason why recording has ended, if it could not continue."""
         self._marked = 0
         self._unreadable = False
         self._files = 0
@@ -109,7 +109,7 @@ class Recorder(Closeable):
     def policy(
         self, contract: Contract, *, graph_hash: str = "", options: Mapping[str, Any] | None = None
     ) -> PolicyFormat:
-        """Return the format under which a policy's records are made; the same one for the same policy."""
+        """Return the format of a policy's records; the same one for the same policy."""
         made = PolicyFormat(contract, graph_hash=graph_hash, options=options)
         made = self._policies.setdefault(made.key, made)
         self._room = min(self._room, max(64, BUFFER_BYTES // made.record_bytes))
@@ -128,7 +128,7 @@ class Recorder(Closeable):
         return True
 
     def close(self) -> None:
-        """Write what is in the buffer and end the file."""
+        """Write the buffer and end the file."""
         atexit.unregister(self.close)
         with self._lock:  # later records are dropped, so that it ends
             self._closing.set()
@@ -154,7 +154,7 @@ class Recorder(Closeable):
             self._end(error)
 
     def _drain(self) -> None:
-        """Write what was in the buffer when this began."""
+        """Write the buffer's content at the call."""
         for _ in range(len(self._buffer)):
             with self._lock:
                 record = self._buffer.popleft()

@@ -14,7 +14,7 @@ from rlservo.serve_app.recording.reader import FileFacts, read_records
 
 
 def repair_recording(path: Path, out: Path) -> FileFacts:
-    """Write the new file `out` and return what reading `path` came to; `path` stays as it is.
+    """Write the new file `out` and return the result of reading `path`, which is not changed.
 
     Any MCAP file can be copied so, another program's as well. Raises UsageError and RecordingError.
     """

@@ -1,4 +1,4 @@
-"""Start of a recording for those who may not have its packages installed."""
+"""Start of a recording in code that does not need its packages otherwise."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class Summary:
 
 
 def summarise_recording(recording: Recording) -> Summary:
-    """Read a recording once and return what is in it. Raises RecordingError."""
+    """Read a recording once and return its summary. Raises RecordingError."""
     found: dict[int, PolicySummary] = {}
     returns: dict[int, list[float]] = {}
     latencies: dict[int, list[float]] = {}

@@ -1,4 +1,4 @@
-"""Estimate: the return a bundle would have earned, from recordings of another policy, before it drives anything.
+"""Estimate of a bundle's return from recordings of another policy, before it drives anything.
 
 If the recorded actions explored, with known log-probabilities, episodes are weighted by how much likelier the bundle
 makes them (per-decision importance sampling: Precup, Sutton, Singh 2000). If they did not, a model of the action's
@@ -32,7 +32,7 @@ SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the t
 
 @dataclass(frozen=True)
 class Estimate:
-    """One way of estimating the bundle's mean return."""
+    """One estimate of the bundle's mean return."""
 
     method: str
     value: float
@@ -41,7 +41,7 @@ class Estimate:
     """Number of the bundle's own episodes with as much information."""
     supported: bool
     reason: str
-    """A sentence: why the interval holds, or why the recordings cannot support it."""
+    """Reason why the interval holds, or why the recordings cannot support it."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ class EstimateReport:
 
     bundle: str
     target: str
-    """Which of the bundle's policies: 'deterministic', as it is served by default, or 'exploring'."""
+    """The bundle's policy: 'deterministic', as it is served by default, or 'exploring'."""
     policies: list[str] = field(default_factory=list)
     gamma: float = 1.0
     episodes: int = 0
@@ -72,7 +72,7 @@ class Trajectory:
 
     rewards: NDArray[np.float64]
     log_weights: NDArray[np.float64] | None
-    """Log of how much likelier each action is under the bundle; None if that is not known."""
+    """Log of each action's probability ratio under the bundle; None if unknown."""
     obs: NDArray[np.float32]
     """`[steps, n]`"""
     actions: NDArray[np.float32]
@@ -93,7 +93,7 @@ def estimate(
 ) -> EstimateReport:
     """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploring one.
 
-    `progress` gets what is being done. Raises OtherContractError if the recording does not fit the bundle, and
+    `progress` gets the current activity. Raises OtherContractError if the recording does not fit the bundle, and
     UsageError if no episode can be used.
     """
     if not 0 < gamma <= 1:
@@ -132,8 +132,8 @@ def estimate(
         report.estimates += importance_sampling(trajectories, gamma, rng)
     elif explore:
         raise UsageError(
-            "an exploring policy's return can be estimated only from recorded actions that explored, with their "
-            f"log-probabilities, and {contract.name}'s did not all: leave --explore out, or record with it"
+            "an exploring policy's return can be estimated only if every recorded action explored and has its "
+            f"log-probability, which {contract.name}'s do not: leave --explore out, or record with it"
         )
     if not explore:
         progress(f"fitting the value of actions to {len(trajectories)} episodes")

@@ -35,7 +35,7 @@ Basis = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Fit:
-    """The bundle's fitted return, and how far to trust it."""
+    """The bundle's fitted return, and its reliability."""
 
     value: float
     resampled: NDArray[np.float64]
@@ -139,7 +139,7 @@ class _Model:
 
 
 def _within(episodes: Sequence[Episode], rows: int) -> list[Episode]:
-    """Return as many of the newest episodes as have at most so many rows, one at least."""
+    """Return the newest episodes with at most this number of rows in total, at least one."""
     kept: list[Episode] = []
     total = 0
     for episode in reversed(episodes):
@@ -151,7 +151,7 @@ def _within(episodes: Sequence[Episode], rows: int) -> list[Episode]:
 
 
 def _basis(rows: NDArray[np.float64], rng: np.random.Generator, *, products: bool) -> Basis:
-    """Return features of state, action and step: squares and products where those are few enough, or random waves."""
+    """Return features of state, action and step: squares and products if those are few enough, else random waves."""
     mean, scale = rows.mean(axis=0), rows.std(axis=0)
     varies = scale > 1e-6 * np.maximum(1.0, np.abs(mean))
     mean, scale = mean[varies], scale[varies]

@@ -37,7 +37,7 @@ class OtherContractError(UsageError):
 
 @dataclass(frozen=True)
 class FollowedEpisode:
-    """An episode and what the bundle would have done in it. Rows that are not `known` hold zeros."""
+    """An episode and the bundle's decisions in it. Rows that are not `known` hold zeros."""
 
     episode: Episode
     known: NDArray[np.bool_]
@@ -67,9 +67,9 @@ class Follower:
         return self.policy.contract
 
     def follow(self, recording: Recording, name: str | None = None) -> Iterator[FollowedEpisode]:
-        """Yield every episode of the policy `name`, of the bundle's own name by default, or of the only one there is.
+        """Yield every episode of the policy `name`, of the bundle's own name by default, or of the only one.
 
-        Raises OtherContractError where its observations or actions are others than the bundle's.
+        Raises OtherContractError if its observations or actions are others than the bundle's.
         """
         wanted = self.contract.name if name is None else name
         found = False
@@ -159,7 +159,7 @@ class Follower:
 
 
 def _follow_at_once(policy: Policy, episode: Episode) -> FollowedEpisode | None:
-    """Follow an episode with a policy that remembers nothing; None if a row needs a look of its own."""
+    """Follow an episode with a policy without memory; None if a row must be computed alone."""
     known = np.flatnonzero(episode.acted)
     action = {name: np.zeros_like(leaf) for name, leaf in episode.action.items()}
     inputs: NDArray[Any] | None = None
@@ -189,7 +189,7 @@ def _follow_at_once(policy: Policy, episode: Episode) -> FollowedEpisode | None:
 def _is_close_only(
     episode: Episode, action: dict[str, NDArray[Any]], inputs: NDArray[Any] | None, rows: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """Return which rows differ from what was recorded by no more than rounding may."""
+    """Return the rows that differ from the recorded ones only by rounding."""
     pairs = [(leaf[rows], action[name][rows]) for name, leaf in episode.action.items()]
     explored = episode.explored[rows]
     close = np.zeros(len(rows), np.bool_)

@@ -1,4 +1,4 @@
-"""Replay: the differences between what was recorded and what a bundle does with the same observations."""
+"""Replay: differences between recorded actions and a bundle's on the same observations."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ElementDifference:
 
 @dataclass(frozen=True)
 class Moment:
-    """One of the largest differences. They are ranked in parts of the element's range, if it has one."""
+    """One of the largest differences, ranked relative to the element's range, if it has one."""
 
     time_s: float
     episode: str
@@ -226,7 +226,7 @@ class _Comparison:
 
 
 def _same_bits(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which rows are the same bit for bit."""
+    """Return the rows that are the same bit for bit."""
     rows = len(one)
     ours, theirs = (np.ascontiguousarray(array).reshape(rows, -1).view(np.uint8) for array in (one, other))
     return np.asarray((ours == theirs).all(axis=1))
@@ -235,7 +235,7 @@ def _same_bits(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
 def _distribution_difference(
     recorded: NDArray[np.float32], replayed: NDArray[Any]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return (which rows are the same, each row's largest difference); two infinities are the same."""
+    """Return (mask of the equal rows, each row's largest difference); two infinities are the same."""
     same = (recorded == replayed).all(axis=1)
     with np.errstate(invalid="ignore"):
         difference = np.abs(recorded.astype(np.float64) - replayed)

@@ -50,7 +50,7 @@ def rollout(
     disturb: str | None = None,
     unproven: bool = False,
 ) -> RolloutReport:
-    """Run `episodes` episodes of `env_id` with `policy` and return what came of it.
+    """Run `episodes` episodes of `env_id` with `policy` and return the report.
 
     Episode i (from 0) is reset with seed + i, so that any one can be repeated alone; with `explore` its draws follow
     from the same number. With rate 'real' the loop keeps the control rate on an absolute schedule, as on a robot: a
@@ -172,7 +172,7 @@ def rollout(
 
 
 def _link_of(policy: ActingPolicy) -> Link | None:
-    """Return what a policy behind a network counted; None for one in process."""
+    """Return the counts of a policy behind a network; None for one in process."""
     counts, fallback, inner = LinkCounts(), None, policy
     while (wrapped := getattr(inner, "policy", None)) is not None:  # in a fallback, a recording, or both
         if isinstance(inner, WithFallback):
@@ -223,7 +223,7 @@ class _Pacer:
 
 @dataclass
 class _PacedPolicy:
-    """A policy whose `act` waits for its turn, and the time every `act` took [s]."""
+    """A policy whose `act` waits for its time, and the time every `act` took [s]."""
 
     policy: ActingPolicy
     pacer: _Pacer
@@ -247,7 +247,7 @@ class _PacedPolicy:
 
 @dataclass
 class _ReportedEnv:
-    """An environment whose rewards and ends are reported as what the last action brought."""
+    """An environment whose rewards and ends are reported as the last action's outcome."""
 
     env: EpisodeEnv
     report_outcome: Callable[..., None]

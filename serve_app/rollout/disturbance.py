@@ -1,4 +1,4 @@
-"""Disturbances of a rollout, written as `latency=3,noise=real`: parsed, and laid around an environment.
+"""Disturbances of a rollout, written as `latency=3,noise=real`: parsed, and applied to an environment.
 
 | kind | size | what it does |
 |---|---|---|
@@ -53,7 +53,7 @@ class DisturbanceError(UsageError):
 
 
 def parse_disturbance(text: str) -> Disturbance:
-    """Return what `kind=size,kind=size` means. Raises UsageError for an unknown kind or a size that cannot be."""
+    """Parse `kind=size,kind=size`. Raises UsageError for an unknown kind or an impossible size."""
     arguments: dict[str, Any] = {}
     for part in text.split(","):
         kind, equals, size = (piece.strip() for piece in part.partition("="))
@@ -75,7 +75,7 @@ def parse_disturbance(text: str) -> Disturbance:
 
 
 def disturb_env(env: gym.Env[Any, Any], disturbance: Disturbance) -> gym.Env[Any, Any]:
-    """Return the environment with the disturbance. Raises DisturbanceError, naming what the environment lacks."""
+    """Return the environment with the disturbance. Raises DisturbanceError, naming the missing method."""
     from gymnasium.envs.registration import load_env_creator
 
     # By name, as Gymnasium's registry has classes: driving a third-party environment needs no simulator of ours.

@@ -58,7 +58,7 @@ class DisturbedRow:
 
 @dataclass(frozen=True)
 class DisturbanceTable:
-    """The rows that were measured, and why others were not."""
+    """The measured rows, and reasons for the skipped ones."""
 
     env_id: str
     policy: str
@@ -139,7 +139,7 @@ def render_table(table: DisturbanceTable) -> Table:
 
 
 def check_plot(out: Path) -> None:
-    """Raise UsageError where `plot_table` would after minutes of episodes: no such folder, no matplotlib."""
+    """Raise the UsageError that `plot_table` would raise after minutes of episodes: no such folder, no matplotlib."""
     if not out.parent.is_dir():
         raise UsageError(f"the plot's folder {str(out.parent)!r} does not exist: make it first")
     formats = optional_package("matplotlib.figure", "a plot").Figure().canvas.get_supported_filetypes()
@@ -150,7 +150,7 @@ def check_plot(out: Path) -> None:
 def plot_table(table: DisturbanceTable, out: str | Path) -> None:
     """Draw success (or the return, if there is none) with its interval, a line for each disturbance.
 
-    Raises UsageError where matplotlib is missing.
+    Raises UsageError if matplotlib is missing.
     """
     figures = optional_package("matplotlib.figure", "a plot")
     rows = table.rows[::-1]
@@ -198,7 +198,7 @@ def _success(row: DisturbedRow) -> str:
 def _possible(
     env_id: str, arguments: Mapping[str, Any], disturbances: Sequence[str]
 ) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Return the disturbances to measure, and of the standard ones those that the environment cannot do."""
+    """Return the disturbances to measure, and the standard ones that the environment does not support."""
     env = make_env(env_id, arguments, render=False)
     try:
         if disturbances:

@@ -1,4 +1,4 @@
-"""Make the environment of a rollout and check that the policy fits it."""
+"""Environment of a rollout, and the check that the policy fits it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def check_proven(contract: Contract, env: gym.Env[Any, Any]) -> None:
 
 
 def control_rate_of(env: gym.Env[Any, Any], arguments: Mapping[str, Any], contract: Contract) -> float | None:
-    """Return the rate at which actions are due [Hz]: the environment's own word, else the contract's, else render_fps.
+    """Return the rate at which actions are due [Hz]: the environment's own, else the contract's, else render_fps.
 
     `render_fps` comes last because in Gymnasium's own environments it is a wish about videos (Pendulum: 30 at 20 Hz).
     """

@@ -53,7 +53,7 @@ class LinkCounts:
 
 
 class WithFallback(ActingPolicy):
-    """A policy that always has an action in time, for as long as what it wraps keeps its deadline.
+    """A policy that always has an action in time, as long as the wrapped policy keeps its deadline.
 
     ```python
     policy = WithFallback(StreamClient(url, "ur5", deadline_ms=50), "hold")
@@ -85,7 +85,7 @@ class WithFallback(ActingPolicy):
         self._logged_at = -LOG_EVERY_S
         self.counts = LinkCounts()
         self.failure: RlservoError | None = None
-        """Why the last action is the fallback's; None if the policy gave it."""
+        """Reason why the last action is the fallback's; None if the policy gave it."""
 
     @property
     def name(self) -> str:
@@ -135,7 +135,7 @@ class WithFallback(ActingPolicy):
         self._policy.reset()
 
     def outcome(self, reward: float | None = None, **brought: Any) -> None:
-        """Pass on what the last action brought to a policy that takes it (`RemotePolicy.outcome`)."""
+        """Pass the last action's outcome on to a policy that takes it (`RemotePolicy.outcome`)."""
         pass_on = getattr(self._policy, "outcome", None)
         if pass_on is not None:
             pass_on(reward, **brought)
@@ -194,7 +194,7 @@ def _zero(contract: Contract) -> Any:
 
 
 def _parse_action(contract: Contract, action: Any) -> Any:
-    """Return a given action as the space has it; raise UsageError if it is none."""
+    """Return a given action in the space's form; raise UsageError if it is not one."""
     space: SpaceSpec = contract.action_space
     leaves: dict[str, Any] = {}
     try:

@@ -106,7 +106,7 @@ def latency_of(latencies_s: Sequence[float]) -> Latency | None:
 
 
 def render_steps(step_sizes: Mapping[str, StepSize], which: Literal["mean", "largest"]) -> str:
-    """Return the sizes of steps in words: of the action, and of commanded velocities in their units."""
+    """Return the sizes of steps as text: of the action, and of commanded velocities in their units."""
     return ", ".join(
         f"action {getattr(size, which):.3g}" if what == ACTION else f"velocity {getattr(size, which):.3g} {what}"
         for what, size in step_sizes.items()

@@ -36,7 +36,7 @@ class _Steps:
 
 @dataclass
 class MeasuredEnv:
-    """An environment that measures the steps of the actions it is given and of the velocities it commands.
+    """An environment that measures the steps of its actions and of the commanded velocities.
 
     An action of choices has none. Velocities are of an environment with a `commanded_velocity` by unit, and begin
     with a robot at rest.

@@ -1,4 +1,4 @@
-"""Write an environment's `rgb_array` frames to an mp4 file."""
+"""Mp4 video of an environment's `rgb_array` frames."""
 
 from __future__ import annotations
 

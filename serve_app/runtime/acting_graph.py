@@ -29,7 +29,7 @@ MESSAGES = {
 
 
 def without_value(model: bytes) -> bytes:
-    """Return a serialized ONNX model without its output `value` and what is computed for that alone."""
+    """Return a serialized ONNX model without its output `value` and its nodes."""
     message = build_messages("rlservo.onnx", MESSAGES)["Model"].FromString(model)
     graph = message.graph
     _drop(graph.output, lambda output: output.name == VALUE)
@@ -50,7 +50,7 @@ def without_value(model: bytes) -> bytes:
 
 
 def _inputs(node: Any) -> Iterator[str]:
-    """Yield what a node takes, and what the graphs inside it may take from outside."""
+    """Yield a node's inputs, and the possible outer inputs of the graphs inside it."""
     yield from node.input
     for attribute in node.attribute:
         for graph in (attribute.g, *attribute.graphs):

@@ -61,20 +61,20 @@ class CompiledPolicy(Policy):
                 raise BundleTamperedError(f"{each} is not the file that was proven: {COMPILE_FILE} has another hash")
         library = CompiledLibrary(file, about["prefix"], contract)
         if library.bundle != about["bundle"]:
-            raise BundleTamperedError(f"{file} was compiled from another bundle than {COMPILE_FILE} says")
+            raise BundleTamperedError(f"{file} was compiled from another bundle than the one in {COMPILE_FILE}")
         bundle = Bundle(folder, contract, recorded, about["bundle"])
         super().__init__(bundle, cast(Any, library), options, graph_hash=recorded[file.name])
 
 
 def open_policy(path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS, check_golden: bool = True) -> Policy:
-    """Return the policy of a bundle, or of a folder that `rlservo compile` wrote. Raises what either raises."""
+    """Return the policy of a bundle, or of a folder that `rlservo compile` wrote. Raises the errors of both."""
     if (Path(path) / COMPILE_FILE).is_file():
         return CompiledPolicy(path, options=options)
     return Policy.load(path, options=options, check_golden=check_golden)
 
 
 def acting_contract(contract: Contract) -> Contract:
-    """Return the contract of what acts and nothing else: no distribution, no value."""
+    """Return the contract of the acting part: no distribution, no value."""
     wanted = {*leaf_specs(contract.action_space, "action"), *(f"state_out.{state.name}" for state in contract.state)}
     outputs = tuple(tensor for tensor in contract.outputs if tensor.name in wanted)
     return contract.model_copy(update={"distribution": None, "outputs": outputs})
@@ -124,7 +124,7 @@ class CompiledLibrary:
         self._own = threading.local()
 
     def run(self, names: Sequence[str], feed: Mapping[str, NDArray[Any]], _options: Any = None) -> list[NDArray[Any]]:
-        """Return the named outputs `[batch, ...]`, computed row by row. Raises what a refused row is refused for."""
+        """Return the named outputs `[batch, ...]`, computed row by row. Raises a refused row's error."""
         codes, outputs = self.step(feed)
         for code in codes[is_refused(codes)][:1].tolist():
             kind, element = code >> 24, self._element(code).decode("utf-8", "replace")
@@ -165,5 +165,5 @@ class CompiledLibrary:
 
 
 def is_refused(code: Any) -> Any:
-    """Return whether a result code, or which of an array of them, comes without an action."""
+    """Return whether a result code (or each of an array) comes without an action."""
     return code >> 24 >= min(REFUSED)

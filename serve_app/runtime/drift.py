@@ -38,7 +38,7 @@ class Drift:
 
     @classmethod
     def of(cls, contract: Contract) -> Self | None:
-        """Return the statistics for a policy, or None where its contract has no filter over the raw observation."""
+        """Return the statistics for a policy, or None if its contract has no filter of the raw observation."""
         space, moments = contract.observation_space, training_moments(contract)
         if moments is None or not isinstance(space, BoxSpec):
             return None
@@ -71,7 +71,7 @@ class Drift:
 def training_moments(contract: Contract) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return each observed element's mean and standard deviation in training, flat.
 
-    None if the contract has no filter over the raw observation.
+    None if the contract has no filter of the raw observation.
     """
     space = contract.observation_space
     step = contract.baked_in[0] if contract.baked_in else None

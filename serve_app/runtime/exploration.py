@@ -30,7 +30,7 @@ from rlservo.export.contract.spaces import (
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """An exploring action, and what a recording keeps of how it came about."""
+    """An exploring action, and its origin for a recording."""
 
     action: dict[str, NDArray[Any]]
     """By tensor name, `[batch, *shape]`, ready for the environment."""

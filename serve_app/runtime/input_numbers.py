@@ -1,4 +1,4 @@
-"""Callers' numbers as arrays: which fit, the slack at their bounds, and errors for what is not a number."""
+"""Callers' numbers as arrays: range checks, the slack at bounds, and errors for values that are not numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ RELATIVE_SLACK = 1e-5  # of the bound, or of 1 if that is larger
 
 
 def rounding_slack(low: NDArray[Any], high: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.float64]:
-    """Return by how much a value in [low, high] may lie outside after rounding to float32; integers round nothing."""
+    """Return the distance by which float32 rounding may put a value of [low, high] outside; 0 for integers."""
     if dtype.kind != "f":
         return np.zeros(low.shape)
     slack: NDArray[np.float64] = RELATIVE_SLACK * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
@@ -51,7 +51,7 @@ def to_array(given: Any) -> NDArray[Any]:
 
 
 def find_unfit(array: NDArray[Any], dtype: np.dtype[Any]) -> tuple[NDArray[np.bool_], str] | None:
-    """Return (which numbers an integer or bool `dtype` does not have, why); None if it has all of them.
+    """Return (mask of the numbers that an integer or bool `dtype` cannot hold, reason); None if it holds all of them.
 
     A float so large that it stands for several integers fits none: the sender may have meant another one.
     """

@@ -37,7 +37,7 @@ class ObservationParser:
         options: PolicyOptions = DEFAULT_OPTIONS,
         drift: Drift | None = None,
     ) -> None:
-        """`drift` is of a space that is a single array."""
+        """`drift` is for a space that is a single array."""
         self._policy = policy
         self._space = space
         self.leaves = {
@@ -46,7 +46,7 @@ class ObservationParser:
         }
 
     def parse(self, obs: Any) -> Observed:
-        """Raise ObservationError, which names the path of what does not fit."""
+        """Raise ObservationError, which names the path of the unfit part."""
         if isinstance(self._space, DictSpec) and isinstance(obs, list | tuple) and obs and isinstance(obs[0], Mapping):
             return self._parse_list(obs)
         leaves: dict[str, Any] = {}

@@ -95,7 +95,7 @@ class LeafParser:
         return array, batch, ""
 
     def _pack(self, obs: list[Any]) -> tuple[NDArray[Any], list[float]] | None:
-        """Return (array, its numbers) of a list of finite numbers; None for all else, which is for `_read`."""
+        """Return (array, its numbers) of a list of finite numbers; None for anything else, which `_read` handles."""
         if self._packer is None or not NUMBERS.issuperset(map(type, obs)):
             return None
         array: NDArray[Any] = np.empty(self._one, self._dtype)
@@ -246,7 +246,7 @@ class LeafParser:
         )
 
     def _refuse_values(self, obs: Any, array: NDArray[Any]) -> NoReturn:
-        """The array is of strings or objects: name the first element that is not a number."""
+        """Name the first element that is not a number of an array of strings or objects."""
         path = first_non_number(obs, ())
         if path is None:
             self._refuse(f"it holds {array.dtype} values, not numbers")

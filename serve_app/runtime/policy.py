@@ -54,7 +54,7 @@ Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Decision of the policy in an episode that took another course (`Policy.follow`)."""
+    """Decision of the policy in an episode driven by another one (`Policy.follow`)."""
 
     leaves: dict[str, NDArray[Any]]
     """The deterministic action by tensor name, `[batch, *shape]`."""
@@ -66,7 +66,7 @@ class Answer:
 
 @dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
 class Step:
-    """One step of an episode: the action, the next state, and what the network was given."""
+    """One step of an episode: the action, the next state, and the network's inputs."""
 
     action: Any
     """In the action space's own form, a batch with its axis on every leaf."""
@@ -75,17 +75,17 @@ class Step:
     state: State
     """State for the next step, `[batch, *shape]`; empty for a stateless policy."""
     batch: int | None
-    """Number of observations; None for one that came alone."""
+    """Number of observations; None for a single one."""
     inputs: Mapping[str, NDArray[Any]]
     """Inputs of the network, by tensor name."""
     notices: tuple[str, ...] = ()
     """Warnings on values out of bounds or beyond a limit that were used anyway."""
     last_action: dict[str, NDArray[Any]] | None = None
-    """The caller's last action as a limit on the step counted from it, by tensor name; None if it gave none."""
+    """The caller's last action, from which a limit on the step counts, by tensor name; None if not given."""
 
     @property
     def rows(self) -> int:
-        """Number of episodes it was a step of."""
+        """Number of its episodes."""
         return self.batch or 1
 
     @property
@@ -116,7 +116,7 @@ class Policy(Closeable):
         self._bundle = bundle
         self._graph_hash = graph_hash
         self.identity = f"{contract.name}/{contract.version}#{graph_hash[:SHOWN_HASH]}"
-        """Name, version and graph, the same wherever it is loaded: a recurrent state goes to the policy of its own."""
+        """Name, version and graph, the same on every machine: a recurrent state belongs to one policy."""
         self._contract = contract
         self._ort_session: onnxruntime.InferenceSession | None = ort_session
         self._run: Run = ort_session.run
@@ -333,14 +333,14 @@ class Policy(Closeable):
         return observed
 
     def build_action(self, computed: Mapping[str, NDArray[Any]], *, batch: bool) -> Any:
-        """Return the action that the network's outputs are (`parse`, `network`), checked. Raises ActionError."""
+        """Return the checked action of the network's outputs (`parse`, `network`). Raises ActionError."""
         for name, check in self._action_checks.items():
             check.check(computed[name])
         own = {name: computed[name] if batch else computed[name][0, ...] for name in self._action_checks}
         return build_action(self._contract.action_space, own)
 
     def network(self) -> Network:
-        """Return the network: from what `parse` gives to the action's tensors by name (`build_action` checks them).
+        """Return the network: from `parse`'s result to the action's tensors by name (`build_action` checks them).
 
         It is onnxruntime's own `run`: a running computation ends normally even if the policy is closed meanwhile.
         """
@@ -386,7 +386,7 @@ class Policy(Closeable):
         return action, feed, batch, notices
 
     def _log(self, notices: tuple[str, ...]) -> None:
-        """Log a notice once in `NOTICE_EVERY_S`, with how many there were."""
+        """Log a notice once in `NOTICE_EVERY_S`, with its count."""
         for sentence in notices:
             self._unlogged += 1
             now = time.monotonic()

@@ -29,7 +29,7 @@ class StateTensors:
         self.has_reward = any(tensor.name == REWARD for tensor in contract.inputs)
         self._choices = contract.action_space if isinstance(contract.action_space, DiscreteSpec) else None
         self.outputs = [f"state_out.{name}" for name in self._specs]
-        """The graph's outputs to ask for besides the action."""
+        """The graph's outputs needed besides the action."""
 
     def inputs(self, state: State | None, rows: int, reward: ArrayLike | None) -> dict[str, NDArray[Any]]:
         """Return the graph's inputs besides the observation; a state of None begins an episode in every row.
@@ -55,7 +55,7 @@ class StateTensors:
         return after
 
     def parse(self, state: Mapping[str, ArrayLike], rows: int, *, batch: bool) -> State:
-        """Return a caller's state as the graph's arrays. Raises RequestError, naming what does not fit."""
+        """Return a caller's state as the graph's arrays. Raises RequestError, naming the unfit part."""
         missing = [name for name in self._specs if name not in state]
         unknown = [str(name)[:64] for name in state if name not in self._specs]
         if missing or unknown:

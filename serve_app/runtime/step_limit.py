@@ -1,4 +1,4 @@
-"""Limit on how far each element of an action may move in one step.
+"""Limit on the step of each element of an action.
 
 A network may answer a small change of its observation with a large change of its action; a gearbox may not. Who
 remembers the last action is the caller's affair.
