@@ -66,7 +66,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "ray.rllib": ("export/rllib/", "serve_app/learning/rllib_"),
     "ray.tune": ("export/rllib/",),
     "uvicorn": ("serve_app/engines/local.py", "serve_app/engines/http_bounds.py"),
-    "fastapi": (),
+    "fastapi": ("serve_app/protocols/openapi.py",),
     "torch": (
         "export/graph/", "export/proof/", "export/rllib/", "export/sources/", "export/export_policy.py",
     ),
