@@ -278,7 +278,7 @@ def _check_filter(files: PolicyFiles, facts: CheckpointFacts, restored: Restored
         options.notify(f"{why}; {trained}")
     elif frozen is not None and steps is not None and frozen.count < steps / 2:
         options.notify(
-            f"the observation filter's statistics are of {frozen.count:,} observations; {trained}: those that "
+            f"the observation filter's statistics come from {frozen.count:,} observations; {trained}: those that "
             "acted in training had seen more than the checkpoint holds"
         )
 

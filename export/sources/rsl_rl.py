@@ -145,7 +145,9 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
         import torch
 
         exported.obs_normalizer = torch.nn.Identity()  # it is the recipe's
-    untrained = f"the normalizer's statistics are of {frozen.count} observations" if frozen and not frozen.count else ""
+    untrained = (
+        f"the normalizer's statistics come from {frozen.count} observations" if frozen and not frozen.count else ""
+    )
     policy = TorchPolicy(recipe, exported, _traced(len(memory)), lambda: _Reference(acting))
     elements = ElementNames((), terms.elements, terms.control_rate_hz)
     return restored(policy, elements, str(file), f"{type(acting).__module__}.{type(acting).__qualname__}", untrained)

@@ -134,7 +134,7 @@ def _restore(file: Path, agent_file: Path, notify: Notify) -> RestoredPolicy:
             "mean_actions", actions
         ), state
 
-    untrained = f"the scaler's statistics are of {frozen.count} observation" if frozen and frozen.count <= 1 else ""
+    untrained = f"the scaler's statistics come from {frozen.count} observation" if frozen and frozen.count <= 1 else ""
     names = (Q_VALUES if is_q else ACTION_DIST_INPUTS,) if scored else ()
     traced = TorchPolicy(recipe, policy, act, lambda: reference, names)
     return restored(traced, ElementNames((), terms.elements, terms.control_rate_hz), str(file), "", untrained)

@@ -247,7 +247,7 @@ class Promotion:
         if served is None:
             return f"policy '{terms.policy}' is no longer served"
         if served.production != self._production:
-            what = f"'{PRODUCTION}' points to {served.production} and no longer to {self._production}"
+            what = f"'{PRODUCTION}' leads to {served.production} and no longer to {self._production}"
         elif terms.version not in served.versions:
             what = f"version {terms.version} is no longer loaded"
         elif served.canary != self._canary:

@@ -104,7 +104,7 @@ class Release:
                 return
             if there is not None and before is not None and there != before:
                 raise ConflictError(
-                    f"alias '{alias}' of policy '{name}' points to version {there}, but this run had moved it to "
+                    f"alias '{alias}' of policy '{name}' leads to version {there}, but this run had moved it to "
                     f"{before}: is another learner moving it? Give each its own --alias"
                 )
             client.alias(name, alias, version, expected=there)

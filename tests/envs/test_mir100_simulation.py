@@ -335,5 +335,5 @@ def test_misuse_is_refused_in_a_sentence() -> None:
         sim.place((0.0, 1.0))
     with pytest.raises(ValueError, match=r"the pose of the cube 1 is \[inf, 0.0, 0.0\]"):
         sim.place(MIDDLE, cubes=[AWAY[0], (math.inf, 0.0, 0.0), AWAY[2]])
-    with pytest.raises(ValueError, match="2 cubes were given, world 'lab_6x8' has 3"):
+    with pytest.raises(ValueError, match="2 cubes were given; world 'lab_6x8' has 3"):
         sim.place(MIDDLE, cubes=AWAY[:2])

@@ -154,7 +154,10 @@ def test_q_learners_go_on_from_sac(algorithm: str, one_ray: OneRay, zoo: Path, t
         (("--run", "BC", "--epochs", "0"), "--epochs is 0"),
         (("--run", "BC", "--set", "num_learners=1"), "--set num_learners: one learner in this process"),
         (("--run", "BC", "--from", "nowhere"), "nowhere does not exist"),
-        (("--run", "BC", "--from", str(UR5)), "its actions are Box(-1.0, 1.0, (5,), float32), recorded are Box("),
+        (
+            ("--run", "BC", "--from", str(UR5)),
+            "its actions are Box(-1.0, 1.0, (5,), float32), the recordings have Box(",
+        ),
     ],
 )
 def test_wrong_arguments_are_refused_in_a_sentence(

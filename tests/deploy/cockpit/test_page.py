@@ -171,7 +171,7 @@ def test_a_server_that_goes_away_is_said_and_comes_back(app: Any, windows: Windo
         with served_on(app, free_port):
             opened = driven(windows, source, Choice("ur5", "production"), seed=5)
             drive, _, window = cleanup.enter_context(opened)
-        window.wait_for("waiting for the policy, the robot stands")
+        window.wait_for("waiting for the policy; the robot holds still")
         with served_on(app, free_port):
             wait_for(lambda: "waiting for the policy" not in window.text(), "it is back")
             cycles = drive.history[-1].number

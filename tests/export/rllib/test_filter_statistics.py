@@ -80,7 +80,7 @@ def test_statistics_that_are_not_trainings_are_exported_only_where_asked_for(
     with pytest.raises(CheckpointError, match=words + r".*--untrained-filter"):
         export(layout_zoo / name)
     result = export(layout_zoo / name, untrained_filter=True)
-    assert any("the observation filter's statistics are of" in notice for notice in notices)
+    assert any("the observation filter's statistics come from" in notice for notice in notices)
     assert_acts_as_restored(result, layout_zoo / f"{name}.npz")
 
 

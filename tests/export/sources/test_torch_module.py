@@ -106,7 +106,7 @@ class Branching(nn.Module):
 @pytest.mark.parametrize(
     ("module", "options", "kind", "words"),
     [
-        (network(3), {}, UnsupportedError, r"action of shape \(2, 3\), the action space .* wants \(2, 2\)"),
+        (network(3), {}, UnsupportedError, r"action of shape \(2, 3\), the action space .* expects \(2, 2\)"),
         (nn.Linear(5, 2), {}, UnsupportedError, "Linear does not run on an observation of Box"),
         (network(), {"scale": [1, 2, 3]}, UsageError, r"scale has shape \(3,\), the action \(2,\)"),
         (network(), {"scale": np.nan}, UsageError, "scale is not finite"),

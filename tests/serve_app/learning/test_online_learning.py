@@ -195,7 +195,7 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
             with cell.admin() as client:
                 client.alias("policy", "learning", "1")
 
-        with pytest.raises(ConflictError, match="points to version 1, but this run had moved it to 2"):
+        with pytest.raises(ConflictError, match="leads to version 1, but this run had moved it to 2"):
             cell.learning(run, sleep=play_and_move).run(versions=1)
     assert cell.aliases()["learning"] == "1"
 

@@ -147,7 +147,7 @@ def test_exploring_return_needs_recorded_log_probabilities(policies: Path, tmp_p
     policy = Policy.load(policies / "gridworld")
     with WithRecording(policy, tmp_path / "run.mcap") as record:
         walk(policy, 40, np.random.default_rng(0), record, explore=False)
-    with pytest.raises(UsageError, match="explored, with their log-probabilities"):
+    with pytest.raises(UsageError, match="explored and has its log-probability"):
         estimate(Recording(tmp_path / "run.mcap"), policies / "gridworld", explore=True)
 
 
