@@ -134,7 +134,6 @@ class _Connection:
         except Exception as error:  # RuntimeError, logic_error as RuntimeError, boost's own
             hint = "enable remote control on the pendant (local, top right)" if self.is_e_series else "see the pendant"
             raise RobotError(f"the controller at {host} takes no program ({str(error).strip()}): {hint}") from error
-        self.control.setWatchdog(settings.limits.watchdog_hz)
 
     def _check_model(self, settings: StreamSettings, model: str, version: str) -> None:
         is_e_series = not version.startswith("3.")
@@ -185,6 +184,7 @@ class CommandStream:
 
     def run(self, on_ready: Callable[[], None]) -> None:
         """Command the arm until asked to end, after decelerating; `on_ready` is called after the first cycle."""
+        self._robot.control.setWatchdog(self._limits.watchdog_hz)  # commands must follow at once
         due = before = time.monotonic()
         while True:
             now = time.monotonic()
@@ -228,7 +228,10 @@ class CommandStream:
             name = STOP_NAMES.get(safety, "safety_stop")
             raise RobotError(f"{name}: find the cause, then unlock the robot on its pendant")
         if not receive.getRobotStatus() & 2:
-            raise RobotError("program_stopped: the controller's watchdog or its pendant ended the program")
+            silence_s = 1.0 / self._limits.watchdog_hz
+            raise RobotError(
+                f"program_stopped: the controller's watchdog (no command for {silence_s:g} s) or its pendant ended it"
+            )
 
     def _command(self, now: float) -> None:
         """Send the next setpoint. A period that was missed is not made good: the arm would have to hurry."""
@@ -244,6 +247,7 @@ class CommandStream:
             setpoint.tolist(), 0.0, 0.0, self._dt, self._limits.lookahead_s, self._limits.gain
         )
         if not is_taken or time.monotonic() - began > SLOW_CALL_S:
+            self._look(time.monotonic())
             self._check()
             raise RobotError("command_refused: the controller took no command, or took too long")
 

@@ -260,9 +260,7 @@ class Controller:
         self.simulation.drive(self._velocity)
         self.ticks += 1
         data = self.simulation.data
-        self.trace.append(
-            Sample(self.time_s, data.qpos.copy(), data.qvel.copy(), self._velocity.copy(), self.commands)
-        )
+        self.trace.append(Sample(self.time_s, data.qpos.copy(), data.qvel.copy(), self._velocity.copy(), self.commands))
         if self.simulation.in_collision:
             self.stop_protectively(f"{' and '.join((self.simulation.contacts() or [('?', '?')])[0])} touch")
 
