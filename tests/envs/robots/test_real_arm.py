@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +32,7 @@ from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
+from servers import free_ports
 
 pytest.importorskip("rtde_control")
 
@@ -153,7 +156,8 @@ while True:
 
 
 def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_taken(arm: RunningArm) -> None:
-    with real_env(arm) as env:
+    address = f"127.0.0.1:{free_ports(1)[0]}"
+    with real_env(arm, metrics=address) as env:
         env.reset(seed=1)
         action = np.array([0.2, -0.4, 0.5, 0.0, -0.2], dtype=np.float32)
         for _ in range(8):
@@ -168,6 +172,16 @@ def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_
         for _ in range(10):
             _, _, _, _, info = env.step(action)
         assert info["robot"]["state"] in ("run", "blend_in")
+        with urllib.request.urlopen(f"http://{address}/metrics") as reply:
+            lines = reply.read().decode().splitlines()
+        labels = f'robot="{arm.host}"'
+        assert f'rlservo_robot_limited_total{{element="late_setpoint",{labels}}} 1.0' in lines
+        assert f'rlservo_robot_state{{{labels},state="{info["robot"]["state"]}"}} 1.0' in lines
+
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        taken = f"127.0.0.1:{other.getsockname()[1]}"
+        with pytest.raises(RobotError, match=rf"cannot listen on {taken}"), real_env(arm, metrics=taken):
+            pass
 
 
 def test_protective_stop_ends_the_episode_and_the_next_reset_says_what_to_do(arm: RunningArm) -> None:
