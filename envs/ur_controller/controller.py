@@ -59,6 +59,7 @@ class Sample(NamedTuple):
     velocities: Vector  # [rad/s], (6,)
     setpoint_velocity: Vector  # [rad/s], (6,)
     commands: int  # that have arrived since the start
+    held_up_s: float  # since the start, by the machine
 
 
 @dataclass
@@ -259,8 +260,8 @@ class Controller:
             self._velocity = self._next_velocity()
         self.simulation.drive(self._velocity)
         self.ticks += 1
-        data = self.simulation.data
-        self.trace.append(Sample(self.time_s, data.qpos.copy(), data.qvel.copy(), self._velocity.copy(), self.commands))
+        q, qd = self.simulation.data.qpos.copy(), self.simulation.data.qvel.copy()
+        self.trace.append(Sample(self.time_s, q, qd, self._velocity.copy(), self.commands, self.held_up_s))
         if self.simulation.in_collision:
             self.stop_protectively(f"{' and '.join((self.simulation.contacts() or [('?', '?')])[0])} touch")
 

@@ -88,15 +88,18 @@ class ControllerServer:
 
     def serve(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""
-        due = time.perf_counter()
+        due, excused_s = time.perf_counter(), 0.0
         while not stop.is_set():
             now = time.perf_counter()
             if now < due:
                 next_due = min(due, self._waiting[0][0]) if self._waiting else due
                 self._pass_traffic(max(0.0, next_due - now))
                 continue
-            if now - due > HELD_UP_S:
-                self.controller.excuse(now - due)
+            late_s = min(now - due, LONGEST_CATCH_UP_S)
+            if late_s - excused_s > HELD_UP_S:
+                self.controller.excuse(late_s - excused_s)
+                excused_s = late_s
+            excused_s = max(0.0, excused_s - self.controller.dt)  # what this cycle makes good
             due = max(due + self.controller.dt, now - LONGEST_CATCH_UP_S)
             self._pass_traffic(0.0)
             asked, self._asked = self._asked, []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from arms import RunningArm
+from arms import LIMITS, RunningArm
 from bundles import write_leaky_policy
 from cockpits import served_on, wait_for
 from rlservo.deploy.cockpit.drive import Drive
@@ -259,10 +259,9 @@ def test_a_real_arm_taken_over_by_the_button_is_tagged_in_the_recording(
     arm: RunningArm, two_versions: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("rtde_control")
-    limits = {"watchdog_hz": 2.0, "start_speed": 1.0, "blend_s": 0.1}
     options: dict[str, Any] = {
         "env_id": "rlservo/EndEffectorPositioningURRob-v0",
-        "env_arguments": {"robot": f"rtde://{arm.host}", "ur_model": "ur5", "confirm": False, "limits": limits},
+        "env_arguments": {"robot": f"rtde://{arm.host}", "ur_model": "ur5", "confirm": False, "limits": LIMITS},
     }
     source, choice = BundledPolicies(two_versions), Choice("ur5", "1")
     with pytest.raises(UsageError, match="was never evaluated under latency"):

@@ -1,18 +1,11 @@
-"""A real arm's environment and command stream against the simulated controller, and every fault under motion.
-
-Stopping times are the controller's own: from the cycle of the last command to the one in which the last joint stood.
-"""
+"""A real arm's environment and command stream against the simulated controller."""
 
 from __future__ import annotations
 
-import os
-import signal
 import socket
-import subprocess
-import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,11 +14,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from arms import PATIENCE_S, RunningArm, run_arm
+from arms import LIMITS, PATIENCE_S, RunningArm, run_arm
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.robots.limits import Limits
 from rlservo.envs.robots.rtde_arm import RtdeArm
 from rlservo.envs.ur.parameters import POSITION_LIMITS
+from rlservo.envs.ur_controller.controller import START_JOINTS
 from rlservo.envs.ur_controller.motion import Servo
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.recording.episodes import episodes
@@ -37,11 +31,8 @@ from servers import free_ports
 pytest.importorskip("rtde_control")
 
 ENV = "rlservo/EndEffectorPositioningURRob-v0"
-START = np.array([0.0, -2.5, 1.5, -1.5, -1.4, 0.0])
+START = np.array(START_JOINTS)
 LIMIT = np.array(POSITION_LIMITS)
-WATCHDOG_HZ = 2.0  # the machine may be busy; the product's default is 10
-LIMITS = {"watchdog_hz": WATCHDOG_HZ, "start_speed": 1.0, "blend_s": 0.1}
-BRAKING_S = 0.6  # from full speed here, by the slowest of all ways to stop, with the follower's lag
 
 
 @contextmanager
@@ -54,29 +45,6 @@ def real_env(arm: RunningArm, **arguments: Any) -> Iterator[gym.Env[Any, Any]]:
         yield env
     finally:
         env.close()
-
-
-@pytest.fixture
-def moving(arm: RunningArm) -> Iterator[RtdeArm]:
-    """An arm whose base turns, and is given setpoints by no one any more: they last half a minute."""
-    real = RtdeArm(arm.host, "ur5", setpoint_timeout_s=30.0, limits=Limits.of(LIMITS))
-    try:
-        real.command(START + np.array([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]), 10.0)
-        arm.wait_until(lambda: abs(arm.controller.simulation.joint_velocities[0]) > 0.25)
-        yield real
-    finally:
-        real.close()
-
-
-def time_to_stand(arm: RunningArm, fault: Callable[[], object]) -> float:
-    """Return how long the arm moved on after a fault [s], in its own time, less what the machine held it up."""
-    controller = arm.controller
-    began, held_up_s = controller.time_s, controller.held_up_s
-    fault()
-    arm.wait_until(
-        lambda: controller.time_s > began + 0.1 and bool(abs(controller.simulation.joint_velocities).max() < 0.01)
-    )
-    return arm.last_motion_s() - began - (controller.held_up_s - held_up_s)
 
 
 def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> None:
@@ -95,64 +63,6 @@ def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> 
         assert info["final_status"] == "success"
         assert states <= {"blend_in", "run", "hold"}
     assert [why for _, why in arm.controller.stop_reasons] == ["it came to its end"]
-
-
-def test_killed_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
-    assert time_to_stand(arm, lambda: os.kill(moving.pid, signal.SIGKILL)) < 1.0 / WATCHDOG_HZ + BRAKING_S
-    arm.wait_until(lambda: not arm.controller.is_program_running)
-    assert "watchdog" in arm.controller.stop_reasons[-1][1]
-    assert "killed" in moving.fault()
-
-
-def test_suspended_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
-    try:
-        assert time_to_stand(arm, lambda: os.kill(moving.pid, signal.SIGSTOP)) < 1.0 / WATCHDOG_HZ + BRAKING_S
-        arm.wait_until(lambda: not arm.controller.is_program_running)
-    finally:
-        os.kill(moving.pid, signal.SIGCONT)
-    arm.wait_until(lambda: bool(moving.fault()))
-    # Which of them is seen first: the program that ended, or what it no longer takes.
-    assert moving.fault().partition(":")[0] in ("program_stopped", "connection_lost", "command_refused")
-
-
-def test_link_that_is_down_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
-    link = arm.server.link
-    assert time_to_stand(arm, lambda: setattr(link, "is_down", True)) < 1.0 / WATCHDOG_HZ + BRAKING_S
-    arm.wait_until(lambda: bool(moving.fault()))
-    link.is_down = False
-
-
-def test_emergency_stop_is_a_fault_that_is_named(arm: RunningArm, moving: RtdeArm) -> None:
-    assert time_to_stand(arm, lambda: arm.do(arm.controller.stop_in_emergency)) < BRAKING_S
-    arm.wait_until(lambda: bool(moving.fault()))
-    assert moving.fault().startswith("emergency_stop")
-    with pytest.raises(RobotError, match="emergency stop"):
-        RtdeArm(arm.host, "ur5")
-
-
-def test_policy_process_that_dies_or_is_suspended_leaves_a_standing_arm(arm: RunningArm) -> None:
-    program = f"""
-import time
-import numpy as np
-from rlservo.envs.robots.limits import Limits
-from rlservo.envs.robots.rtde_arm import RtdeArm
-arm = RtdeArm({arm.host!r}, "ur5", limits=Limits.of({LIMITS!r}))
-while True:
-    arm.command(np.array([3.0, -2.5, 1.5, -1.5, -1.4, 0.0]), 10.0)
-    time.sleep(0.05)
-"""
-    policy = subprocess.Popen([sys.executable, "-c", program])
-    try:
-        fast = lambda: bool(abs(arm.controller.simulation.joint_velocities[0]) > 0.25)  # noqa: E731
-        arm.wait_until(fast)
-        assert time_to_stand(arm, lambda: policy.send_signal(signal.SIGSTOP)) < 0.25 + BRAKING_S
-        policy.send_signal(signal.SIGCONT)
-        arm.wait_until(fast)
-        assert time_to_stand(arm, policy.kill) < 0.25 + BRAKING_S
-        arm.wait_until(lambda: not arm.controller.is_program_running)
-    finally:
-        policy.kill()
-        policy.wait()
 
 
 def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_taken(arm: RunningArm) -> None:
