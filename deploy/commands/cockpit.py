@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,6 +67,8 @@ def cockpit(
     if record is not None and (recording is not None or robot_server is not None):
         raise UsageError("--record goes with --url and --bundle")
     arguments = parse_env_arguments(env_arg or [])
+    if "robot" in arguments:  # each change of its state is a line
+        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     with needs_extra("cockpit"):
         from rlservo.deploy.cockpit.run import run_drive, run_playback, run_watch
 

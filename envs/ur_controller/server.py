@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import heapq
 import logging
+import math
 import select
 import socket
 import sys
@@ -99,6 +100,10 @@ class ControllerServer:
             if late_s - excused_s > HELD_UP_S:
                 self.controller.excuse(late_s - excused_s)
                 excused_s = late_s
+            # Commands that wait for a cycle that is made good came one a cycle: all at once they would be a jump.
+            for connection in self._connections.values():
+                if connection.rtde is not None:
+                    connection.rtde.allowance = 1.0 if excused_s else math.inf
             excused_s = max(0.0, excused_s - self.controller.dt)  # what this cycle makes good
             due = max(due + self.controller.dt, now - LONGEST_CATCH_UP_S)
             self._pass_traffic(0.0)
@@ -126,6 +131,8 @@ class ControllerServer:
                 self._accept(each)
             elif each in self._connections:
                 self._read(self._connections[each])
+        for connection in [one for one in self._connections.values() if one.rtde is not None and one.rtde.is_behind]:
+            self._take(connection, b"")
         now = time.perf_counter()
         while self._waiting and self._waiting[0][0] <= now and not self.link.is_down:
             heapq.heappop(self._waiting)[2]()

@@ -94,6 +94,21 @@ def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_
             pass
 
 
+def test_state_that_the_link_delivers_late_is_not_acted_on(arm: RunningArm) -> None:
+    with real_env(arm, limits={**LIMITS, "watchdog_hz": 1.0}) as env:
+        env.reset(seed=1)
+        action = np.array([0.2, -0.4, 0.5, 0.0, -0.2], dtype=np.float32)
+        for _ in range(4):
+            env.step(action)
+        arm.server.link.latency_s = 0.3  # too late to act on, and too soon for the watchdog
+        terminated = False
+        while not terminated:
+            _, _, terminated, _, info = env.step(action)
+        assert info["final_status"] == "stale_observation"
+        assert abs(arm.controller.simulation.joint_velocities).max() < 0.02
+        assert arm.controller.is_program_running
+
+
 def test_protective_stop_ends_the_episode_and_the_next_reset_says_what_to_do(arm: RunningArm) -> None:
     with real_env(arm) as env:
         env.reset(seed=1)
