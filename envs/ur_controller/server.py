@@ -89,22 +89,21 @@ class ControllerServer:
 
     def serve(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""
-        due, excused_s = time.perf_counter(), 0.0
+        due = before = time.perf_counter()
         while not stop.is_set():
             now = time.perf_counter()
             if now < due:
                 next_due = min(due, self._waiting[0][0]) if self._waiting else due
                 self._pass_traffic(max(0.0, next_due - now))
                 continue
-            late_s = min(now - due, LONGEST_CATCH_UP_S)
-            if late_s - excused_s > HELD_UP_S:
-                self.controller.excuse(late_s - excused_s)
-                excused_s = late_s
+            behind_s, since_s, before = now - due, now - before, now
+            if behind_s > HELD_UP_S:  # of a cycle that is made good in no time, no client can be blamed for its silence
+                self.controller.excuse(max(0.0, self.controller.dt - since_s))
             # Commands that wait for a cycle that is made good came one a cycle: all at once they would be a jump.
+            is_made_good = self.controller.dt < behind_s < LONGEST_CATCH_UP_S
             for connection in self._connections.values():
                 if connection.rtde is not None:
-                    connection.rtde.allowance = 1.0 if excused_s else math.inf
-            excused_s = max(0.0, excused_s - self.controller.dt)  # what this cycle makes good
+                    connection.rtde.allowance = 1.0 if is_made_good else math.inf
             due = max(due + self.controller.dt, now - LONGEST_CATCH_UP_S)
             self._pass_traffic(0.0)
             asked, self._asked = self._asked, []
