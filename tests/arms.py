@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import pytest
 
-from rlservo.envs.ur_controller.controller import Controller
+from rlservo.envs.ur_controller.controller import Controller, Sample
 from rlservo.envs.ur_controller.server import CannotListenError, ControllerServer
 
 PATIENCE_S = 60.0
+# Of a real arm in tests. The machine may be busy: the product's watchdog_hz is 10.
+LIMITS = {"watchdog_hz": 2.0, "start_speed": 1.0, "blend_s": 0.1}
 _counter = itertools.count(os.getpid())
 
 
@@ -44,10 +46,10 @@ class RunningArm:
             assert time.monotonic() < limit, "the condition never came true"
             time.sleep(0.02)
 
-    def last_motion_s(self, faster_than: float = 0.01) -> float:
-        """Return when a joint last moved faster [rad/s], in the controller's time."""
+    def last_motion(self) -> Sample:
+        """Return the last control cycle in which a joint moved faster than 0.01 rad/s; the first one where none did."""
         samples = list(self.controller.trace)
-        return max((one.time_s for one in samples if abs(one.velocities).max() > faster_than), default=0.0)
+        return next((one for one in reversed(samples) if abs(one.velocities).max() > 0.01), samples[0])
 
 
 def run_arm(model: str = "ur5e") -> Iterator[RunningArm]:
@@ -61,6 +63,11 @@ def run_arm(model: str = "ur5e") -> Iterator[RunningArm]:
             break
         except CannotListenError:
             continue
+    yield from serving(server)
+
+
+def serving(server: ControllerServer) -> Iterator[RunningArm]:
+    """Run a controller that listens until the generator is closed."""
     stop = threading.Event()
     thread = threading.Thread(target=server.serve, args=(stop,), name="ur-controller")
     thread.start()

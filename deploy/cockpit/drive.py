@@ -32,6 +32,9 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UsageError,
 )
+from rlservo.serve_app.interface import ActingPolicy
+from rlservo.serve_app.recording.recorded_policy import WithRecording
+from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.rollout.episode import success_of
 from rlservo.serve_app.rollout.fallback import StoppedError, WithFallback
 from rlservo.serve_app.runtime.policy import Policy
@@ -55,18 +58,21 @@ class Drive:
         env_id: str | None = None,
         env_arguments: Mapping[str, Any] | None = None,
         seed: int | None = None,
+        recorder: Recorder | None = None,
+        unproven: bool = False,
     ) -> None:
         """Open the policy and make the environment, by default the one it was trained in.
 
-        Raises UsageError if the two do not fit, and the errors of `PolicySource.open`.
+        `recorder` gets every decision and what came of it. Raises UsageError if the two do not fit, or a real robot is
+        not to be driven by a policy that is not proven, and what `PolicySource.open` raises.
         """
-        self._source = source
+        self._source, self._recorder = source, recorder
         self._choice, self._link = choice, Link()
-        self._policy = source.open(choice, self._link)
+        self._use(source.open(choice, self._link))
         try:
             contract = self._policy.contract
             arguments = {**(home_arguments(contract) if env_id is None else {}), **(env_arguments or {})}
-            self._stage = Stage(env_id or home_of(contract), arguments, contract)
+            self._stage = Stage(env_id or home_of(contract), arguments, contract, unproven=unproven)
         except BaseException:
             self._policy.close()
             raise
@@ -185,7 +191,8 @@ class Drive:
             policy.close()
             raise
         self._policy.close()
-        self._policy, self._choice, self._link = policy, choice, link
+        self._use(policy)
+        self._choice, self._link = choice, link
         if stage is not self._stage:
             self._drop_ghost()
             self._stage.close()
@@ -264,6 +271,13 @@ class Drive:
         self._trouble = fallback
         obs, value, difference = self._obs, self._value(), self._step_ghost(action)
         self._obs, self._reward, terminated, truncated, info = self._stage.step(action)
+        self._show_robot(info.get("robot"))
+        if isinstance(self._acting, WithRecording):
+            self._acting.robot, is_over = info.get("robot"), terminated or truncated
+            self._acting.record_outcome(
+                self._reward, terminated=terminated, truncated=truncated,
+                final_status=info.get("final_status"), final_obs=self._obs if is_over else None,
+            )  # fmt: skip
         self._before, self._after, self._since = self._after, self._stage.scene(), time.perf_counter()
         is_late = bool(fallback) or latency_ms > self._late_beyond_ms()
         self._late += is_late
@@ -289,7 +303,12 @@ class Drive:
     def _act(self) -> Any:
         has_reward = any(tensor.name == REWARD for tensor in self._policy.contract.inputs)
         reward: dict[str, Any] = {REWARD: self._reward} if has_reward else {}
-        return self._policy.act(self._obs, **reward)
+        return self._acting.act(self._obs, **reward)
+
+    def _show_robot(self, robot: Mapping[str, Any] | None) -> None:
+        """Show the state of a real robot."""
+        if robot is not None:
+            self._sentence = f"Episode {self._episodes + 1}, robot: {robot['state']}."
 
     def _wait_for_server(self, error: RlservoError) -> None:
         """Report it and ask again soon: the robot holds still, so its observation has not changed."""
@@ -300,7 +319,7 @@ class Drive:
         if isinstance(error, UnknownPolicyError):  # a server that was started again, with other versions
             policy = self._source.open(self._choice, self._link)
             self._policy.close()
-            self._policy = policy
+            self._use(policy)
             self._begin("here", keep_target=True)
 
     def _renew(self) -> None:
@@ -321,7 +340,7 @@ class Drive:
             policy.close()
             raise
         self._policy.close()
-        self._policy = policy
+        self._use(policy)
 
     def _warnings(self) -> tuple[str, ...]:
         inner = self._policy.policy if isinstance(self._policy, WithFallback) else self._policy
@@ -349,7 +368,7 @@ class Drive:
     ) -> None:
         self._next = None
         self._obs = self._stage.begin(start=start, position=position, keep_target=keep_target, seed=seed)
-        self._policy.reset()
+        self._acting.reset()
         self._reward = 0.0
         self._after = self._stage.scene()
         self._before = self._after
@@ -370,6 +389,8 @@ class Drive:
         self._next = ("here" if goes_on else self._start, self._is_users_target)
         self._due = time.perf_counter() + DWELL_S
         self._sentence = f"Episode {self._episodes}: {status}."
+        if not goes_on and getattr(self._stage.env, "is_real", False):
+            self._phase = "paused"  # a person looks at the robot first
 
     def _drag(self, put: Callable[[Vector], None], position: Vector) -> None:
         def put_last() -> None:
@@ -405,6 +426,11 @@ class Drive:
         self._after = moved
 
     # -- parts
+
+    def _use(self, policy: ActingPolicy) -> None:
+        """Act with a policy from now on."""
+        self._policy = policy
+        self._acting = policy if self._recorder is None else WithRecording(policy, self._recorder)
 
     def _late_beyond_ms(self) -> float:
         return min(self._link.deadline_ms, 1e3 * self._stage.cycle_s)

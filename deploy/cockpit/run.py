@@ -18,6 +18,7 @@ from rlservo.deploy.cockpit.policies import Choice, PolicySource
 from rlservo.deploy.cockpit.watch import WatchPanel
 from rlservo.deploy.terminal import ctrl_c_sets
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
+from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.versions.serving_plan import PRODUCTION
 
 OnReady = Callable[[str], None]
@@ -32,13 +33,18 @@ def run_drive(
     env_arguments: Mapping[str, Any],
     port: int,
     seed: int | None,
+    record: Path | None = None,
+    unproven: bool = False,
     on_ready: OnReady,
 ) -> None:
     """Let a policy drive a robot on a page until Ctrl-C. Everything that was opened is closed."""
     with ExitStack() as cleanup:
         cleanup.callback(source.close)
         choice = _first_choice(source, policy, version)
-        drive = Drive(source, choice, env_id=env_id, env_arguments=env_arguments, seed=seed)
+        recorder = None if record is None else cleanup.enter_context(Recorder(record))
+        drive = Drive(
+            source, choice, env_id=env_id, env_arguments=env_arguments, seed=seed, recorder=recorder, unproven=unproven
+        )
         cleanup.callback(drive.close)
         server = cleanup.enter_context(served_page(port, "rlservo cockpit"))
         panel = DrivePanel(server, drive, source)

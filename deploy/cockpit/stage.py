@@ -17,7 +17,7 @@ from rlservo.envs.shapes import Poses, body_poses, moving_bodies
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.environment_id import NAMESPACE
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.rollout.environment import check_fit, control_rate_of, make_env
+from rlservo.serve_app.rollout.environment import check_fit, check_proven, control_rate_of, make_env
 
 Vector = NDArray[np.float64]
 
@@ -46,8 +46,13 @@ class Scene:
 class Stage:
     """One robot in one environment."""
 
-    def __init__(self, env_id: str, arguments: Mapping[str, Any], contract: Contract | None = None) -> None:
-        """Raise UsageError if there is no such environment, it is none of ours, or the policy does not fit it."""
+    def __init__(
+        self, env_id: str, arguments: Mapping[str, Any], contract: Contract | None = None, *, unproven: bool = False
+    ) -> None:
+        """Raise UsageError if there is no such environment, it is none of ours, or the policy does not fit it.
+
+        `unproven`: a real robot takes any policy.
+        """
         self.env_id, self.arguments = env_id, dict(arguments)
         self._made = make_env(env_id, self.arguments, render=False)
         env = self._made.unwrapped
@@ -57,14 +62,20 @@ class Stage:
         self.env = env
         self._bodies = moving_bodies(env.model)
         self._disturbed: DomainRandomization = DomainRandomization(self._made)
-        self.cycle_s = 0.1
+        self.cycle_s, self._unproven = 0.1, unproven
         if contract is not None:
-            self.check(contract)
+            try:
+                self.check(contract)
+            except UsageError:
+                self._made.close()
+                raise
             self.cycle_s = 1.0 / (control_rate_of(self._made, self.arguments, contract) or 10.0)
 
     def check(self, contract: Contract) -> None:
-        """Raise UsageError if a policy's observations or actions differ from the environment's."""
+        """Raise UsageError if a policy's spaces are others than the environment's, or a real robot may not take it."""
         check_fit(contract, self._made, self.arguments)
+        if not self._unproven:
+            check_proven(contract, self._made)
 
     def disturb(self, disturbance: Disturbance) -> None:
         """Change the disturbances, from the next episode on. Raises ValueError for an unsupported one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,6 +39,12 @@ def cockpit(
     robot_server: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Show a robot server's simulation while a client drives it.")
     ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record what is driven, and who drives, into a new .mcap file or a folder.")
+    ] = None,
+    unproven: Annotated[
+        bool, typer.Option("--unproven", help="Real robot: take a policy that no evaluation under latency proves.")
+    ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page, on 127.0.0.1.")] = PORT,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the first episode.")] = None,
     api_key: Annotated[
@@ -57,7 +64,11 @@ def cockpit(
             "give one of --url (a server), --bundle (in process), --recording (with or without --bundle) and "
             "--robot-server"
         )
+    if record is not None and (recording is not None or robot_server is not None):
+        raise UsageError("--record goes with --url and --bundle")
     arguments = parse_env_arguments(env_arg or [])
+    if "robot" in arguments:  # each change of its state is a line
+        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     with needs_extra("cockpit"):
         from rlservo.deploy.cockpit.run import run_drive, run_playback, run_watch
 
@@ -76,6 +87,8 @@ def cockpit(
             env_arguments=arguments,
             port=port,
             seed=seed,
+            record=record,
+            unproven=unproven,
             on_ready=_tell,
         )
 

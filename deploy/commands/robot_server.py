@@ -73,6 +73,9 @@ def robot_server_ur(
     ] = "mujoco",
     limit: Limit = None,
     yes: Annotated[bool, typer.Option("--yes", help="Real arm: go to a SetState's pose without asking here.")] = False,
+    metrics: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Real arm: where Prometheus reads its state and limits.")
+    ] = None,
     reference_frame: Annotated[str, typer.Option(help="base_link (simulation) or base (the real controller's).")] = (
         "base_link"
     ),
@@ -106,6 +109,7 @@ def robot_server_ur(
             objects=None if model is None else tuple(model),
             robot=robot,
             confirm=not yes,
+            metrics=metrics,
             limits=parse_env_arguments(limit or []),
         )
         _serve(settings, f"{ur_model}, {rs_mode}, {action_mode}, {action_cycle_rate:g} Hz")

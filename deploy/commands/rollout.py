@@ -68,7 +68,7 @@ def rollout(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Real robot: move to a start without asking.")] = False,
     unproven: Annotated[
-        bool, typer.Option("--unproven", help="Real robot: accept a policy that was never evaluated under latency.")
+        bool, typer.Option("--unproven", help="Real robot: accept a policy that no evaluation under latency proves.")
     ] = False,
     as_json: Json = False,
 ) -> None:

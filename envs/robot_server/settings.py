@@ -72,6 +72,7 @@ class URSettings(Common):
     robot: str = MUJOCO  # or rtde://HOST
     limits: dict[str, Any] = field(default_factory=dict)  # of a real arm, as envs/robots/limits.py has them
     confirm: bool = True  # ask at the terminal before a real arm moves to a pose of SetState
+    metrics: str | None = None  # HOST:PORT at which Prometheus reads a real arm's
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -41,6 +41,7 @@ class URRobot:
             settings.ur_model,
             limits=settings.limits,
             confirm=settings.confirm,
+            metrics=settings.metrics,
             max_velocity_scale=settings.max_velocity_scale_factor,
             cycle_s=self.cycle_s,
             objects=settings.object_names,

@@ -74,9 +74,8 @@ ORDERS = np.dtype(
 )  # fmt: skip
 REPORT = np.dtype(
     [("phase", "f8"), ("received_s", "f8"), ("time_s", "f8"), ("age_s", "f8"), ("positions", "f8", 6),
-     ("velocities", "f8", 6), ("robot_mode", "f8"), ("safety_mode", "f8"), ("speed_fraction", "f8"),
-     ("setpoint", "f8", 6), ("setpoint_velocity", "f8", 6), ("number", "f8"), ("blend", "f8"), ("cycles", "f8"),
-     ("longest_gap_s", "f8"), ("written_s", "f8"), ("limited", "f8", len(COUNTED))]
+     ("velocities", "f8", 6), ("robot_mode", "f8"), ("safety_mode", "f8"), ("setpoint", "f8", 6), ("blend", "f8"),
+     ("written_s", "f8"), ("limited", "f8", len(COUNTED))]
 )  # fmt: skip
 
 
@@ -134,7 +133,7 @@ class _Connection:
         except Exception as error:  # RuntimeError, logic_error as RuntimeError, boost's own
             hint = "enable remote control on the pendant (local, top right)" if self.is_e_series else "see the pendant"
             raise RobotError(f"the controller at {host} takes no program ({str(error).strip()}): {hint}") from error
-        self.control.setWatchdog(settings.limits.watchdog_hz)
+        self.control.setWatchdog(settings.limits.watchdog_hz)  # from here on commands must follow at once
 
     def _check_model(self, settings: StreamSettings, model: str, version: str) -> None:
         is_e_series = not version.startswith("3.")
@@ -164,12 +163,11 @@ class _Connection:
 class CommandStream:
     """The loop. `run` returns when it is told to end or at a fault, whose sentence it raises as RobotError."""
 
-    def __init__(self, settings: StreamSettings, connection: _Connection) -> None:
+    def __init__(self, settings: StreamSettings, connection: _Connection, simulation: URSimulation) -> None:
         self._settings, self._limits, self._robot = settings, settings.limits, connection
         self._orders = SharedBlock(settings.orders_descriptor, ORDERS)
         self._report = SharedBlock(settings.report_descriptor, REPORT)
         self._dt = 1.0 / connection.rate_hz
-        simulation = URSimulation(settings.ur_model, objects=())
         velocities = np.array(simulation.parameters.velocity_limits)
         self._policy_velocities = velocities * settings.velocity_scale * self._limits.speed_scale
         self._start_velocities = np.minimum(velocities, self._limits.start_speed) * self._limits.speed_scale
@@ -180,30 +178,26 @@ class CommandStream:
         self._phase, self._blend = Phase.HOLD, 0.0
         self._robot_s, self._received_s, self._age_s = 0.0, time.monotonic(), 0.0
         self._usual_offset_s = float("inf")
-        self._cycles, self._longest_gap_s = 0, 0.0
         self.is_asked_to_end = threading.Event()
 
     def run(self, on_ready: Callable[[], None]) -> None:
         """Command the arm until asked to end, after decelerating; `on_ready` is called after the first cycle."""
-        due = before = time.monotonic()
+        due, is_first = time.monotonic(), True
         while True:
             now = time.monotonic()
             if now < due:
                 time.sleep(due - now)
                 now = time.monotonic()
             due = max(due + self._dt, now - self._dt)
-            gap = now - before
-            before = now
-            self._longest_gap_s = max(self._longest_gap_s, gap)
             self._look(now)
             self._check()
             if self.is_asked_to_end.is_set() and np.abs(self._limiter.velocity).max() < AT_REST:
                 return
             self._command(now)
-            self._cycles += 1
             self._publish()
-            if self._cycles == 1:
+            if is_first:
                 on_ready()
+            is_first = False
 
     def fail(self) -> None:
         """Publish that there is a fault."""
@@ -228,7 +222,10 @@ class CommandStream:
             name = STOP_NAMES.get(safety, "safety_stop")
             raise RobotError(f"{name}: find the cause, then unlock the robot on its pendant")
         if not receive.getRobotStatus() & 2:
-            raise RobotError("program_stopped: the controller's watchdog or its pendant ended the program")
+            silence_s = 1.0 / self._limits.watchdog_hz
+            raise RobotError(
+                f"program_stopped: the controller's watchdog (no command for {silence_s:g} s) or its pendant ended it"
+            )
 
     def _command(self, now: float) -> None:
         """Send the next setpoint. A period that was missed is not made good: the arm would have to hurry."""
@@ -244,6 +241,7 @@ class CommandStream:
             setpoint.tolist(), 0.0, 0.0, self._dt, self._limits.lookahead_s, self._limits.gain
         )
         if not is_taken or time.monotonic() - began > SLOW_CALL_S:
+            self._look(time.monotonic())
             self._check()
             raise RobotError("command_refused: the controller took no command, or took too long")
 
@@ -307,13 +305,8 @@ class CommandStream:
                 "velocities": receive.getActualQd(),
                 "robot_mode": receive.getRobotMode(),
                 "safety_mode": receive.getSafetyMode(),
-                "speed_fraction": receive.getTargetSpeedFraction(),
                 "setpoint": self._limiter.position,
-                "setpoint_velocity": self._limiter.velocity,
-                "number": self._number,
                 "blend": self._blend,
-                "cycles": self._cycles,
-                "longest_gap_s": self._longest_gap_s,
                 "written_s": time.monotonic(),
                 "limited": self._counts,
             }
@@ -328,9 +321,10 @@ def main(argv: list[str]) -> None:
     os.dup2(2, 1)  # ur_rtde writes to standard output
     stream = None
     try:
+        simulation = URSimulation(settings.ur_model, objects=())  # takes longer than the watchdog waits
         connection = _Connection(settings)
         try:
-            stream = CommandStream(settings, connection)
+            stream = CommandStream(settings, connection, simulation)
             signal.signal(signal.SIGTERM, lambda *_: stream.is_asked_to_end.set())
             threading.Thread(target=_end_with_standard_input, args=(stream,), name="lifeline", daemon=True).start()
             stream.run(lambda: _say(output, READY))

@@ -10,7 +10,13 @@ from rlservo.envs.ur.simulation import URSimulation
 
 
 def make_arm(
-    robot: str, ur_model: str, *, limits: Mapping[str, Any] | None = None, confirm: bool = True, **scene: Any
+    robot: str,
+    ur_model: str,
+    *,
+    limits: Mapping[str, Any] | None = None,
+    confirm: bool = True,
+    metrics: str | None = None,
+    **scene: Any,
 ) -> URSimulation:
     """Return the arm and its scene; `scene` is `URSimulation`'s. Raises RobotError where there is none to be had."""
     host = host_of(robot)
@@ -32,4 +38,5 @@ def make_arm(
             limits=checked,
         )
 
-    return MirroredSimulation(ur_model, connect=connect, operator=Operator(is_asked=confirm), **scene)
+    operator = Operator(is_asked=confirm)
+    return MirroredSimulation(ur_model, connect=connect, operator=operator, metrics=metrics, **scene)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -21,6 +21,9 @@ from rlservo.envs.robots.operator_terminal import Operator
 from rlservo.envs.robots.rtde_arm import RtdeArm
 from rlservo.envs.robots.states import State, StateMachine
 from rlservo.envs.ur.simulation import URSimulation
+
+if TYPE_CHECKING:
+    from rlservo.envs.robots.metrics import ArmMetrics
 
 AT_START = 0.03  # [rad], from which on the arm need not move
 PATH_STEP = 0.05  # [rad], between two poses of a way that are looked at
@@ -44,9 +47,13 @@ class MirroredSimulation(URSimulation):
         operator: Operator,
         max_velocity_scale: float,
         cycle_s: float,
+        metrics: str | None = None,
         **scene: Any,
     ) -> None:
-        """`connect` takes the time [s] after which the arm holds without a setpoint. Raises what it raises."""
+        """`connect` takes the time [s] after which the arm holds without a setpoint. Raises what it raises.
+
+        `metrics` is the address, HOST:PORT, at which Prometheus reads the arm's.
+        """
         super().__init__(ur_model, max_velocity_scale=max_velocity_scale, cycle_s=cycle_s, **scene)
         self.operator = operator
         self.states = StateMachine()
@@ -58,6 +65,17 @@ class MirroredSimulation(URSimulation):
         self._lost: dict[str, int] = {}  # counts of connections that are closed
         self._arm = self._connected()
         self.state_seen = self._arm.arm_state()
+        self._metrics: ArmMetrics | None = None
+        if metrics is not None:
+            from rlservo.envs.robots.metrics import ArmMetrics
+
+            try:
+                self._metrics = ArmMetrics(
+                    metrics, self._arm.host, counts=self.limited, state=lambda: self.states.state
+                )
+            except RobotError:
+                self._arm.close()
+                raise
 
     # -- instead of the simulation's
 
@@ -165,6 +183,8 @@ class MirroredSimulation(URSimulation):
         self.states.enter(State.STOP, "the environment is closed")
         self.operator.close()
         self._arm.close()
+        if self._metrics is not None:
+            self._metrics.close()
 
     # -- parts
 

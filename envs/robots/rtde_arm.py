@@ -153,10 +153,6 @@ class RtdeArm:
         counts = self._report.read()["limited"]
         return {name: int(count) for name, count in zip(COUNTED, counts, strict=True) if count}
 
-    def longest_gap_s(self) -> float:
-        """Return the longest time between two commands to the robot [s]."""
-        return float(self._report.read()["longest_gap_s"])
-
     def fault(self) -> str:
         """Return why the arm does not take commands any more; empty where it does."""
         if not self._fault:

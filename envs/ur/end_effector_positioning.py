@@ -275,7 +275,8 @@ class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
     the arm slowly to its start, in a straight line of joint space, after asking at the terminal.
 
     Of its own are `limits` (names and defaults: `rlservo.envs.robots.limits.Limits`), `confirm` (False: `reset` does
-    not ask), and `info["robot"]`: the state, its changes, and the limits that were kept since the last step.
+    not ask), `metrics` (HOST:PORT at which Prometheus reads state and limits), and `info["robot"]`: the state, its
+    changes, and the limits that were kept since the last step.
     """
 
     def __init__(self, *, robot: str = "", **arguments: Any) -> None:

@@ -58,6 +58,8 @@ class Sample(NamedTuple):
     positions: Vector  # [rad], (6,)
     velocities: Vector  # [rad/s], (6,)
     setpoint_velocity: Vector  # [rad/s], (6,)
+    commands: int  # that have arrived since the start
+    held_up_s: float  # since the start, by the machine
 
 
 @dataclass
@@ -85,6 +87,7 @@ class Controller:
         self.speed_fraction = 1.0
         self.payload_kg = 0.0
         self.ticks = 0
+        self.commands = 0  # packages with a command, or a sign of life, that have arrived
         self.held_up_s = 0.0  # since the start, by the machine
         self.trace: deque[Sample] = deque(maxlen=TRACE)
         self.stop_reasons: list[tuple[float, str]] = []  # when [s], why
@@ -171,6 +174,7 @@ class Controller:
 
     def feed_watchdog(self, register: int) -> None:
         """Note that an input register was written."""
+        self.commands += 1
         if self._watchdog is not None and self._watchdog.register == register:
             self._watchdog.fed_at_s = self.time_s
 
@@ -256,8 +260,8 @@ class Controller:
             self._velocity = self._next_velocity()
         self.simulation.drive(self._velocity)
         self.ticks += 1
-        data = self.simulation.data
-        self.trace.append(Sample(self.time_s, data.qpos.copy(), data.qvel.copy(), self._velocity.copy()))
+        q, qd = self.simulation.data.qpos.copy(), self.simulation.data.qvel.copy()
+        self.trace.append(Sample(self.time_s, q, qd, self._velocity.copy(), self.commands, self.held_up_s))
         if self.simulation.in_collision:
             self.stop_protectively(f"{' and '.join((self.simulation.contacts() or [('?', '?')])[0])} touch")
 

@@ -5,6 +5,7 @@ Source of the protocol: Universal Robots, "Real-Time Data Exchange (RTDE) Guide"
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -107,6 +108,7 @@ class RtdeSession:
     def __init__(self, controller: Controller, registers_in_use: dict[str, RtdeSession]) -> None:
         self._controller, self._in_use = controller, registers_in_use
         self._buffer = b""
+        self.allowance = math.inf  # data packages that may still be taken in this cycle
         self._inputs: list[tuple[list[str], struct.Struct]] = []
         self._outputs: list[Callable[[Controller], Any]] = []
         self._package = struct.Struct(">")
@@ -121,11 +123,17 @@ class RtdeSession:
             size, kind = HEADER.unpack_from(self._buffer)
             if not HEADER.size <= size <= LARGEST_PACKAGE:
                 raise ValueError(f"a package of {size} bytes: expected {HEADER.size} to {LARGEST_PACKAGE}")
-            if len(self._buffer) < size:
+            if len(self._buffer) < size or (chr(kind) == "U" and self.allowance < 1.0):
                 break
+            self.allowance -= chr(kind) == "U"
             payload, self._buffer = self._buffer[HEADER.size : size], self._buffer[size:]
             replies += self._answer(chr(kind), payload)
         return replies
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether bytes wait to be taken."""
+        return len(self._buffer) >= HEADER.size
 
     def sample(self) -> bytes:
         """Return the data package of this control cycle; nothing if the client is not due one."""

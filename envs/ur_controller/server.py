@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import heapq
 import logging
+import math
 import select
 import socket
 import sys
@@ -88,15 +89,21 @@ class ControllerServer:
 
     def serve(self, stop: threading.Event) -> None:
         """Serve until `stop` is set."""
-        due = time.perf_counter()
+        due = before = time.perf_counter()
         while not stop.is_set():
             now = time.perf_counter()
             if now < due:
                 next_due = min(due, self._waiting[0][0]) if self._waiting else due
                 self._pass_traffic(max(0.0, next_due - now))
                 continue
-            if now - due > HELD_UP_S:
-                self.controller.excuse(now - due)
+            behind_s, since_s, before = now - due, now - before, now
+            if behind_s > HELD_UP_S:  # of a cycle that is made good in no time, no client can be blamed for its silence
+                self.controller.excuse(max(0.0, self.controller.dt - since_s))
+            # Commands that wait for a cycle that is made good came one a cycle: all at once they would be a jump.
+            is_made_good = self.controller.dt < behind_s < LONGEST_CATCH_UP_S
+            for connection in self._connections.values():
+                if connection.rtde is not None:
+                    connection.rtde.allowance = 1.0 if is_made_good else math.inf
             due = max(due + self.controller.dt, now - LONGEST_CATCH_UP_S)
             self._pass_traffic(0.0)
             asked, self._asked = self._asked, []
@@ -123,6 +130,8 @@ class ControllerServer:
                 self._accept(each)
             elif each in self._connections:
                 self._read(self._connections[each])
+        for connection in [one for one in self._connections.values() if one.rtde is not None and one.rtde.is_behind]:
+            self._take(connection, b"")
         now = time.perf_counter()
         while self._waiting and self._waiting[0][0] <= now and not self.link.is_down:
             heapq.heappop(self._waiting)[2]()

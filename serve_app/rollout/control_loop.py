@@ -59,7 +59,7 @@ def rollout(
     A policy behind a URL gets rewards and ends, for a server that records or promotes by success. `record` receives
     every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
     `disturb` disturbs environment and robot (`latency=3,noise=real`; `disturbance.py` has the kinds).
-    A real robot takes a policy only if its contract has an evaluation under latency, or with `unproven`.
+    A real robot takes a policy only if evaluations in its contract prove it under latency, or with `unproven`.
     `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set; so does a
     fallback (`WithFallback`) that is to stop, with `stopped`.
 

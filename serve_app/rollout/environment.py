@@ -13,9 +13,12 @@ from rlservo.export.contract.environment_id import importing_id
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import install, needs_extra
 from rlservo.export.contract.spaces import BoxSpec, DictSpec, MultiBinarySpec, MultiDiscreteSpec, SpaceSpec, TupleSpec
+from rlservo.serve_app.rollout.disturbance import parse_disturbance
 
 if TYPE_CHECKING:
     import gymnasium as gym
+
+PROVEN_SUCCESS = 0.8  # of a policy for a real robot, at the lower end of its 95% interval: at least 16 of 16 episodes
 
 
 def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.Env[Any, Any]:
@@ -38,15 +41,32 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
 
 
 def check_proven(contract: Contract, env: gym.Env[Any, Any]) -> None:
-    """Raise UsageError if the robot is real and the policy was never evaluated under latency."""
+    """Raise UsageError where the robot is real and no evaluation under latency shows that the policy succeeds."""
     if not getattr(env.unwrapped, "is_real", False):
         return
-    if not any("latency" in (one.disturbance or "") for one in contract.evaluations):
-        raise UsageError(
-            f"policy '{contract.name}' version {contract.version} was never evaluated under latency: measure the robot "
-            "with `rlservo robot-latency`, evaluate with the `rlservo verify --disturb ... --write` that it prints, or "
-            "pass --unproven"
+    found = [one for one in contract.evaluations if _action_latency(one.disturbance)]
+    bounds = [one.success_interval[0] for one in found if one.success_interval is not None]
+    if max(bounds, default=0.0) >= PROVEN_SUCCESS:
+        return
+    why = "was never evaluated under latency"
+    if found:
+        rows = ", ".join(
+            f"{one.disturbance}: {one.success_rate_bundle or 0.0:.0%} of {one.episodes} episodes" for one in found
         )
+        why = f"succeeded too rarely, or in too few episodes, under latency ({rows})"
+    raise UsageError(
+        f"policy '{contract.name}' version {contract.version} {why}: a real robot takes one whose 95% interval of "
+        f"success begins at {PROVEN_SUCCESS:.0%} or above. Measure the robot with `rlservo robot-latency`, evaluate "
+        "with the `rlservo verify --disturb ... --write` that it prints, or pass --unproven"
+    )
+
+
+def _action_latency(disturbance: str | None) -> int:
+    """Return the control cycles by which actions were late in every episode of an evaluation."""
+    if disturbance is None or "latency=" not in disturbance:
+        return 0
+    lowest: int = parse_disturbance(disturbance).arguments.get("action_latency", (0, 0))[0]
+    return lowest
 
 
 def control_rate_of(env: gym.Env[Any, Any], arguments: Mapping[str, Any], contract: Contract) -> float | None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from arms import LIMITS, RunningArm
 from bundles import write_leaky_policy
 from cockpits import served_on, wait_for
 from rlservo.deploy.cockpit.drive import Drive
@@ -19,6 +20,9 @@ from rlservo.deploy.cockpit.stage import Disturbance, Scene, Stage
 from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.recording.episodes import episodes
+from rlservo.serve_app.recording.reader import Recording
+from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import over_uvicorn
 from stores import load_store
@@ -249,3 +253,33 @@ def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(two_versions: 
     finally:
         drive.close()
         source.close()
+
+
+def test_a_real_arm_taken_over_by_the_button_is_tagged_in_the_recording(
+    arm: RunningArm, two_versions: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("rtde_control")
+    options: dict[str, Any] = {
+        "env_id": "rlservo/EndEffectorPositioningURRob-v0",
+        "env_arguments": {"robot": f"rtde://{arm.host}", "ur_model": "ur5", "confirm": False, "limits": LIMITS},
+    }
+    source, choice = BundledPolicies(two_versions), Choice("ur5", "1")
+    with pytest.raises(UsageError, match="was never evaluated under latency"):
+        Drive(source, choice, **options)
+    arm.wait_until(lambda: not arm.controller.is_program_running)
+    with Recorder(tmp_path / "run.mcap") as recorder:
+        drive = Drive(source, choice, recorder=recorder, unproven=True, **options)
+        try:
+            drive.start()
+            wait_for(lambda: "robot: run" in drive.view.sentence, "the policy drives")
+            drive.do(drive.take_over)
+            wait_for(lambda: arm.controller.is_free, "a person can lead the arm")
+            drive.do(drive.take_over)
+            wait_for(lambda: not arm.controller.is_free and "robot: run" in drive.view.sentence, "the policy drives on")
+            arm.do(lambda: arm.controller.stop_protectively("a test"))
+            wait_for(lambda: drive.view.phase == "paused", "the drive waits for a person")
+        finally:
+            drive.close()
+    driven = [one for episode in episodes(Recording(tmp_path / "run.mcap")) for one in episode.robot]
+    assert {one["state"] for one in driven} >= {"run", "human", "fault"}
+    assert driven[-1]["state"] == "fault"

@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -90,7 +92,34 @@ wait_until(lambda: abs(receive.getActualQd()[0]) < 1e-3)
     )
     stopped_at_s, why = arm.controller.stop_reasons[0]
     assert "watchdog" in why
-    assert arm.last_motion_s() - stopped_at_s < 0.3
+    assert arm.last_motion().time_s - stopped_at_s < 0.3
+
+
+def test_time_that_the_machine_takes_from_the_controller_is_excused_once(arm: RunningArm) -> None:
+    began = time.monotonic()
+    arm.do(lambda: time.sleep(0.5))
+    ticks = arm.controller.ticks
+    arm.wait_until(lambda: arm.controller.ticks > ticks + 400)
+    assert 0.4 < arm.controller.held_up_s <= time.monotonic() - began
+
+
+def test_commands_that_waited_while_the_machine_held_the_controller_up_are_no_jump(arm: RunningArm) -> None:
+    at_work = lambda: arm.controller.commands > 100  # noqa: E731
+    held = threading.Thread(target=lambda: (arm.wait_until(at_work), arm.do(lambda: time.sleep(0.25))))
+    held.start()
+    drive(
+        arm,
+        """
+target = receive.getActualQ()
+for _ in range(400):
+    target[0] += 0.002
+    assert control.servoJ(target, 0.0, 0.0, 0.002, 0.03, 300.0)
+    time.sleep(0.002)
+""",
+    )
+    held.join()
+    assert arm.controller.held_up_s > 0.2
+    assert arm.controller.safety_mode.name == "NORMAL"
 
 
 def test_jump_of_the_target_is_a_protective_stop_that_the_dashboard_unlocks_after_5_s(arm: RunningArm) -> None:

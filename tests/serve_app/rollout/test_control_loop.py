@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from typing_extensions import Self
 
-from rlservo.export.contract.contract import Contract, Parity, Provenance, TensorSpec
+from rlservo.export.contract.contract import Contract, Evaluation, Parity, Provenance, TensorSpec
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec
 from rlservo.serve_app.rollout.control_loop import rollout
@@ -106,8 +106,10 @@ class Corridor(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
     open_ones = 0
 
-    def __init__(self, render_mode: str | None = None, speak: bool = True, break_at: int = 99) -> None:
-        self.render_mode, self.speak, self.break_at = render_mode, speak, break_at
+    def __init__(
+        self, render_mode: str | None = None, speak: bool = True, break_at: int = 99, is_real: bool = False
+    ) -> None:
+        self.render_mode, self.speak, self.break_at, self.is_real = render_mode, speak, break_at, is_real
         self.observation_space = gym.spaces.Box(-10, 10, (1,), np.float32)
         self.action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
         Corridor.open_ones += 1
@@ -346,6 +348,40 @@ def test_an_unknown_environment_is_named_with_its_close_matches() -> None:
 def test_wrong_constructor_arguments_are_a_usage_error() -> None:
     with pytest.raises(UsageError, match="cannot be made with"):
         rollout(corridor_policy(), CORRIDOR, episodes=1, env_kwargs={"colour": "red"})
+
+
+def evaluated(disturbance: str | None, successes: int | None, episodes: int = 100) -> Evaluation:
+    return Evaluation(
+        env_id=CORRIDOR, episodes=episodes, first_seed=0, return_bundle=0.0, disturbance=disturbance,
+        success_rate_bundle=None if successes is None else successes / episodes,
+        success_interval=None if successes is None else wilson_interval(successes, episodes), evaluated_at="2026-01-01",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("evaluation", "sentence"),
+    [
+        (evaluated(None, 100), "was never evaluated under latency"),
+        (evaluated("none", 100), "was never evaluated under latency"),
+        (evaluated("observation_latency=2", 100), "was never evaluated under latency"),
+        (evaluated("latency=0..3", 100), "was never evaluated under latency"),
+        (evaluated("latency=3,noise=real", 70), r"too rarely.*\(latency=3,noise=real: 70% of 100 episodes\)"),
+        (evaluated("latency=3", 5, episodes=5), r"too few episodes.*\(latency=3: 100% of 5 episodes\)"),
+        (evaluated("latency=3", None), "succeeded too rarely"),
+        (evaluated("latency=3", 95), None),
+    ],
+)
+def test_a_real_robot_takes_a_policy_that_succeeds_under_latency_often_enough(
+    evaluation: Evaluation, sentence: str | None
+) -> None:
+    contract = corridor_policy().contract.model_copy(update={"evaluations": (evaluation,)})
+    policy = WrittenPolicy(contract, lambda _: 0.5)
+    options: dict[str, Any] = {"episodes": 1, "env_kwargs": {"is_real": True}}
+    if sentence is not None:
+        with pytest.raises(UsageError, match=sentence):
+            rollout(policy, CORRIDOR, **options)
+        options["unproven"] = True
+    assert rollout(policy, CORRIDOR, **options).successes == 1
 
 
 @pytest.mark.parametrize(
