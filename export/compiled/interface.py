@@ -203,8 +203,8 @@ def bounds_of(member: Member, slack: NDArray[np.float64]) -> tuple[NDArray[Any],
     low, high = (np.clip(each, float(least), float(most)) for each in (low, high))
     if kind.kind != "f":  # in Python's integers: the largest of 64 bits are no doubles
         whole = [map(math.ceil, low.tolist()), map(math.floor, high.tolist())]
-        down, up = ([min(max(value, int(least)), int(most)) for value in each] for each in whole)
-        return np.array(down, kind), np.array(up, kind)
+        ends = [[min(max(value, int(least)), int(most)) for value in each] for each in whole]
+        return np.array(ends[0], kind), np.array(ends[1], kind)
     down, up = low.astype(kind), high.astype(kind)
     down = np.where(down.astype(np.float64) < low, np.nextafter(down, kind.type(np.inf)), down)
     up = np.where(up.astype(np.float64) > high, np.nextafter(up, kind.type(-np.inf)), up)

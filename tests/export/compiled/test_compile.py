@@ -40,7 +40,10 @@ def test_the_proof_and_its_figures_stand_in_compile_json(compiled_ur5: Compiled)
     assert about["proof"]["golden_vectors"] == 8
     assert about["proof"]["observations"] == 10_000
     assert 0 < about["proof"]["max_rel"] < 1
-    assert 0 < about["proof"]["step_us"]["median"] <= about["proof"]["step_us"]["longest"]
+    assert (about["proof"]["rounding_used"], about["proof"]["rounding_most"]) == (0, 0.0)
+    times = about["proof"]["step_us"]
+    assert 0 < times["median"] <= times["longest"] and 0 < times["slowest_observation"] <= times["longest"]
+    assert 0 < about["proof"]["stack_bytes"] < 1000
     assert about["proof"]["code_bytes"] < 400_000  # weights and all
     assert set(SOURCES) < set(about["files"])
 

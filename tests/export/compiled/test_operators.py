@@ -130,16 +130,20 @@ def all_operators(root: Path, *more: tuple[str, list[Any], dict[str, Any]], case
             parts.append(f"flat_{output}")
     add("Concat", parts, ["all"], {"axis": 1})
     add("Identity", ["all"], ["action"], {})
+    return bundle_of(folder, nodes, constants, np.clip(some(16, WIDTH) * 2, -1, 1))
+
+
+def bundle_of(folder: Path, nodes: list[Any], constants: dict[str, Any], golden: NDArray[np.float32]) -> Path:
+    """Write a bundle of a graph from `obs` to `action`."""
     save_graph(
         folder / "policy.onnx", nodes, constants, [(X, FLOAT, ["batch", WIDTH])], [("action", FLOAT, ["batch", "n"])]
     )
     import onnxruntime
 
-    obs = np.clip(some(16, WIDTH) * 2, -1, 1)
-    (action,) = onnxruntime.InferenceSession(folder / "policy.onnx").run(["action"], {X: obs})
+    (action,) = onnxruntime.InferenceSession(folder / "policy.onnx").run(["action"], {X: golden})
     size = action.shape[1]
     contract = Contract(
-        name="operators",
+        name=folder.parent.name,
         version="1",
         observation_space=BoxSpec(shape=(WIDTH,), dtype="float32", low=-1.0, high=1.0),
         action_space=BoxSpec(shape=(size,), dtype="float32", low=None, high=None),
@@ -150,7 +154,7 @@ def all_operators(root: Path, *more: tuple[str, list[Any], dict[str, Any]], case
         provenance=PROVENANCE,
         parity=PARITY,
     )
-    return write_bundle(folder, contract, obs)
+    return write_bundle(folder, contract, golden)
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
@@ -158,6 +162,26 @@ def test_every_operator_computes_what_onnxruntime_computes(tmp_path: Path) -> No
     made = compile_bundle(all_operators(tmp_path), tmp_path / "c")
     assert made.proof is not None
     assert made.proof.max_rel < 1
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler")
+def test_what_rounding_explains_is_allowed_and_counted(tmp_path: Path) -> None:
+    """Large numbers that cancel out: what is left depends on the order in which they are added."""
+    folder = tmp_path / "cancelling" / "1"
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    order, matrix = rng.permutation(WIDTH), rng.standard_normal((WIDTH, 3)).astype(np.float32) * 1000
+    nodes = [
+        helper.make_node("Sin", [X], ["sine"]),
+        helper.make_node("Gather", ["sine", "order"], ["shuffled"], axis=1),
+        helper.make_node("MatMul", ["sine", "matrix"], ["one"]),
+        helper.make_node("MatMul", ["shuffled", "shuffled_matrix"], ["other"]),
+        helper.make_node("Sub", ["one", "other"], ["action"]),
+    ]
+    constants = {"order": order, "matrix": matrix, "shuffled_matrix": matrix[order]}
+    made = compile_bundle(bundle_of(folder, nodes, constants, np.zeros((4, WIDTH), np.float32)), tmp_path / "c")
+    assert made.proof is not None and made.proof.max_rel <= 1
+    assert 100 < made.proof.rounding_used < 10_000 and made.proof.rounding_most > 1
 
 
 @pytest.mark.parametrize(
