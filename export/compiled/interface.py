@@ -104,9 +104,8 @@ def header_text(face: Interface, contract: Contract, digest: str, scratch: dict[
         lines += ["", *_elements(u, what, members, identifiers)]
         lines += ["typedef struct {", *(_declared(member) for member in members), f"}} {p}_{what};"]
     memory = [f"        {kind} {kind.removesuffix('_t')}s[{size}];" for kind, size in sorted(scratch.items())]
-    if memory:
-        memory = ["    struct {", *memory, "    } scratch; /* means nothing between two calls */"]
-    members_text = [*(_declared(member) for member in face.state), *memory] or ["    char unused;"]
+    memory = ["    struct {", *memory, "    } scratch; /* means nothing between two calls */"]
+    members_text = [*(_declared(member) for member in face.state), *memory]
     remembers = "the episode so far, and " if face.state else ""
     lines += ["", f"/* Memory of one policy: {remembers}room to compute in. One for each robot or thread. */"]
     lines += ["typedef struct {", *members_text, f"}} {p}_state;", ""]
