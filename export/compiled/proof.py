@@ -201,7 +201,7 @@ def _check(
         )
     name = max(shares, key=lambda each: float(shares[each].max(initial=0.0)))
     if not shares[name].max(initial=0.0) <= 1.0:
-        row, element = np.unravel_index(shares[name].argmax(), shares[name].shape)
+        row, element = divmod(int(shares[name].argmax()), shares[name].shape[1])
         sides = (got, expected, allowed_differences(contract, expected, moved))
         a, b, limit = (side[name][row].ravel()[element] for side in sides)
         raise ParityError(
