@@ -4,8 +4,8 @@
 
 The shipped UR5 policy (27-256-256-5) and the LSTM of the MiR100 are exported and compiled. The self-test, built with
 -DMEASURE, times 20,000 steps; onnxruntime's session and TorchScript get as long, one after the other in each round. A
-round's figure is a step's median, and the smallest of the rounds counts: other programs only add to it. Written to
-bench/compiled_policy.json.
+round's figure is a step's median, and the smallest of the rounds counts: other programs only add to it. Ratios are of
+two figures of one round; their median counts. Written to bench/compiled_policy.json.
 """
 
 from __future__ import annotations
@@ -113,9 +113,15 @@ def main() -> None:
             measured = sides(bundle, made, compiler, folder)
             rounds = [{side: measure() for side, measure in measured.items()} for _ in range(options.rounds)]
             document[checkpoint] = {side: min(each[side] for each in rounds) for side in measured}
-            document[checkpoint]["library_bytes"] = made.about["proof"]["code_bytes"]
-        for side in [side for side in document[CHECKPOINTS[0]] if side != "library_bytes"]:
-            table.add_row(side, *(f"{document[checkpoint][side]:.1f}" for checkpoint in CHECKPOINTS))
+            ratios = {side: float(np.median([each[side] / each["C"] for each in rounds])) for side in measured}
+            document[checkpoint] |= {"as_multiple_of_C": ratios, "proof": made.about["proof"]}
+        for side in measured:
+            figures = [(document[name][side], document[name]["as_multiple_of_C"][side]) for name in CHECKPOINTS]
+            table.add_row(side, *(f"{time:.1f} ({ratio:.1f} x)" for time, ratio in figures))
+        for what in ("slowest_observation", "longest"):
+            table.add_row(f"C, {what.replace('_', ' ')}", *(
+                f"{document[name]['proof']['step_us'][what]:.1f}" for name in CHECKPOINTS))  # fmt: skip
+        table.add_row("C, stack [bytes]", *(str(document[name]["proof"]["stack_bytes"]) for name in CHECKPOINTS))
     Console().print(table)
     out = ROOT / "bench"
     out.mkdir(exist_ok=True)

@@ -46,8 +46,11 @@ def compile(
         lines += [
             f"proven    {proof.golden_vectors} golden vectors, {proof.observations:,} observations beside onnxruntime, "
             f"largest difference {proof.max_abs:.2g} ({proof.max_rel:.0%} of what is allowed)",
-            f"step      {proof.step_us['median']:.1f} µs median, {proof.step_us['p99']:.1f} µs 99%, "
-            f"{proof.step_us['longest']:.0f} µs longest here ({proof.compiler}, {' '.join(proof.flags)})",
+            f"rounding  {proof.rounding_used} observations beyond the contract's tolerance, by no more than rounding "
+            f"explains (at most {proof.rounding_most:.0f} times the tolerance)",
+            f"step      {proof.step_us['median']:.1f} µs median, {proof.step_us['slowest_observation']:.1f} µs for the "
+            f"slowest observation, {proof.step_us['p99']:.1f} µs 99%, {proof.step_us['longest']:.0f} µs longest here "
+            f"({proof.compiler}, {' '.join(proof.flags)})",
             f"memory    {proof.code_bytes / 1000:,.0f} kB code and weights, {proof.state_bytes:,} bytes state"
             + (f", {proof.stack_bytes:,} bytes stack" if proof.stack_bytes is not None else ""),
         ]

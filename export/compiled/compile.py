@@ -7,13 +7,12 @@ import json
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlservo.export.compiled.build_files import build_files
 from rlservo.export.compiled.interface import header_text, interface_of
@@ -25,7 +24,8 @@ from rlservo.export.compiled.tolerance import allowed_differences
 from rlservo.export.contract.bundle import CONTRACT_FILE, ONNX_FILE, load_bundle
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.runtime.compiled_policy import COMPILE_FILE, acting_contract
-from rlservo.serve_app.runtime.loading import check_contract, check_copy, check_golden_vectors, check_graph, open_graph
+from rlservo.serve_app.runtime.loading import open_graph
+from rlservo.serve_app.runtime.policy import Policy
 
 NO_COMPILER = "no C compiler was found; the self-test proves it where there is one"
 
@@ -55,35 +55,26 @@ def compile_bundle(
     into a binary file beside the C. Raises what `Policy.load` does for a bundle, UnsupportedError, naming an operator
     that has no C, ParityError where the compiled policy differs from onnxruntime, and UsageError.
     """
-    folder = Path(out)
-    chosen = find_compiler(compiler)
+    folder, chosen = Path(out), find_compiler(compiler)
     progress("reading the bundle")
+    Policy.load(path).close()  # every check that serving makes
     bundle = load_bundle(path)
-    contract = bundle.contract
-    check_contract(bundle)
+    contract, (golden, recorded) = bundle.contract, bundle.golden()
+    earlier = _earlier(folder, contract.name)
+    ort_run: Callable[..., Sequence[Any]] = open_graph(bundle, 1).run
+    progress("writing C")
     face = interface_of(contract)
-    earlier = _check_free(folder, contract.name)
-    ort_session = open_graph(bundle, 1)
-    check_graph(bundle, ort_session)
-    check_copy(bundle, ort_session)
-    names = [tensor.name for tensor in contract.outputs]
-    check_golden_vectors(bundle, ort_session.run, names)
-    golden, recorded = bundle.golden()
     with bundle.verified_copy(ONNX_FILE) as file:
         model = file.read_bytes()
-    progress("writing C")
     wanted = [tensor.name for tensor in acting_contract(contract).outputs]
-    example = {tensor.name: golden[tensor.name][:1] for tensor in contract.inputs}
-    graph = read_static_graph(model, wanted, example)
+    graph = read_static_graph(model, wanted, {tensor.name: golden[tensor.name][:1] for tensor in contract.inputs})
     source = write_source(face, contract, graph, weights_in_file=weights_in_file)
-    refused = must_not_leave(contract, recorded)
+    allowed, refused = allowed_differences(contract, recorded), must_not_leave(contract, recorded)
     texts = {
         f"{face.prefix}.c": source.text,
         f"{face.prefix}.h": header_text(face, contract, bundle.digest, source.scratch),
-        f"{face.prefix}_test.c": self_test_text(
-            face, golden, recorded, allowed_differences(contract, recorded), refused
-        ),
-        **build_files(face.prefix, contract.version, None if source.weights is None else source.weights.nbytes),
+        f"{face.prefix}_test.c": self_test_text(face, golden, recorded, allowed, refused),
+        **build_files(face.prefix, contract.version),
     }
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".rlservo-compile-", dir=folder.parent) as name:
@@ -95,15 +86,13 @@ def compile_bundle(
         shutil.copyfile(bundle.path / CONTRACT_FILE, beside / CONTRACT_FILE)
         proof, library = None, None
         if chosen is not None:
-            library = f"lib{face.prefix}.so"
+            library, names = f"lib{face.prefix}.so", [tensor.name for tensor in contract.outputs]
             progress(f"proving it with {Path(chosen).name} and 10,000 observations")
-
-            def compute(feed: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-                computed: Sequence[Any] = ort_session.run(names, dict(feed))
-                return dict(zip(names, computed, strict=True))
-
             with np.errstate(over="ignore"):
-                proof = prove(contract, chosen, beside, face.prefix, library, compute, golden)
+                proof = prove(
+                    contract, chosen, beside, face.prefix, library,
+                    lambda feed: dict(zip(names, ort_run(names, dict(feed)), strict=True)), golden,
+                )  # fmt: skip
             (beside / f"{face.prefix}_test").unlink()
         about = {
             "policy": contract.name,
@@ -113,7 +102,7 @@ def compile_bundle(
             "rlservo": installed_version("rlservo"),
             "library": library,
             "unproven": None if proof is not None else NO_COMPILER,
-            "proof": None if proof is None else proof.as_dict(),
+            "proof": None if proof is None else asdict(proof),
             "files": {each.name: hashlib.sha256(each.read_bytes()).hexdigest() for each in sorted(beside.iterdir())},
         }
         (beside / COMPILE_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
@@ -121,16 +110,14 @@ def compile_bundle(
     return Compiled(folder, about, proof)
 
 
-def _check_free(folder: Path, name: str) -> dict[str, str]:
+def _earlier(folder: Path, name: str) -> dict[str, str]:
     """Return the hashes of what an earlier compilation of this policy left in the folder.
 
-    Raises UsageError where the folder has something that this would overwrite: what a user changed or put there.
+    Raises UsageError where the folder has something else under its name.
     """
-    if not folder.exists():
-        return {}
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is a file: expected a folder to write the C into")
     file = folder / COMPILE_FILE
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is a file: expected a folder to write the C into")
     if not file.exists():
         return {}
     try:
@@ -140,18 +127,17 @@ def _check_free(folder: Path, name: str) -> dict[str, str]:
         raise UsageError(f"{file} is not what `rlservo compile` wrote: choose another folder") from error
     if policy != name:
         raise UsageError(f"{folder} holds the compiled policy '{policy}': give '{name}' a folder of its own")
-    return hashes
+    return {**hashes, COMPILE_FILE: hashlib.sha256(file.read_bytes()).hexdigest()}
 
 
 def _take_places(beside: Path, folder: Path, earlier: Mapping[str, str]) -> None:
-    """Move the files into the folder, whose own files of these names have to be an earlier compilation's."""
+    """Move the files into the folder, where only an earlier compilation's own files give way."""
     folder.mkdir(exist_ok=True)
-    for file in beside.iterdir():
-        there = folder / file.name
-        known = file.name == COMPILE_FILE and earlier
-        if there.exists() and not known and hashlib.sha256(there.read_bytes()).hexdigest() != earlier.get(file.name):
+    for name in {*earlier, *(file.name for file in beside.iterdir())}:
+        there = folder / name
+        if there.exists() and hashlib.sha256(there.read_bytes()).hexdigest() != earlier.get(name):
             raise UsageError(f"{there} is not what `rlservo compile` wrote: nothing was overwritten")
-    for name in set(earlier) - {file.name for file in beside.iterdir()}:  # such as a library that was proven
+    for name in earlier:  # such as a library that was proven
         (folder / name).unlink(missing_ok=True)
     for file in sorted(beside.iterdir()):
         file.replace(folder / file.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -103,9 +104,8 @@ def header_text(face: Interface, contract: Contract, digest: str, scratch: dict[
         lines += ["", *_elements(u, what, members, identifiers)]
         lines += ["typedef struct {", *(_declared(member) for member in members), f"}} {p}_{what};"]
     memory = [f"        {kind} {kind.removesuffix('_t')}s[{size}];" for kind, size in sorted(scratch.items())]
-    if memory:
-        memory = ["    struct {", *memory, "    } scratch; /* means nothing between two calls */"]
-    members_text = [*(_declared(member) for member in face.state), *memory] or ["    char unused;"]
+    memory = ["    struct {", *memory, "    } scratch; /* means nothing between two calls */"]
+    members_text = [*(_declared(member) for member in face.state), *memory]
     remembers = "the episode so far, and " if face.state else ""
     lines += ["", f"/* Memory of one policy: {remembers}room to compute in. One for each robot or thread. */"]
     lines += ["typedef struct {", *members_text, f"}} {p}_state;", ""]
@@ -183,25 +183,28 @@ def _ranges(leaf: LeafSpec) -> Iterator[str]:
             yield f"{whole}{a:.9g} .. {b:.9g}"
 
 
-def bounds_of(member: Member, slack: NDArray[np.float64] | float = 0.0) -> tuple[NDArray[Any], NDArray[Any]]:
+def range_of(dtype: np.dtype[Any]) -> tuple[Any, Any]:
+    """Return the smallest and the largest number of a type, as numbers of it; C has bytes for booleans."""
+    info = np.finfo(dtype) if dtype.kind == "f" else np.iinfo(np.uint8 if dtype == np.bool_ else dtype)
+    return info.min, info.max
+
+
+def bounds_of(member: Member, slack: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return a leaf's bounds, moved apart by `slack`, as numbers of its own type, flat.
 
     A number is between these exactly when it is between the contract's, which are double precision.
     """
     assert member.leaf is not None
-    low, high = (each.ravel() for each in member.leaf.bounds())
-    low, high = low - np.ravel(slack), high + np.ravel(slack)
-    if member.dtype.kind != "f":
-        info = np.iinfo(np.uint8 if member.dtype == np.bool_ else member.dtype)
-        whole = [np.clip(np.nan_to_num(each, posinf=2.0**63, neginf=-(2.0**63)), float(info.min), float(info.max))
-                 for each in (np.ceil(low), np.floor(high))]  # fmt: skip
-        kind = np.uint8 if member.dtype == np.bool_ else member.dtype
-        ends = [[min(max(int(value), int(info.min)), int(info.max)) for value in each] for each in whole]
+    kind = np.dtype(np.uint8) if member.dtype == np.bool_ else member.dtype
+    least, most = range_of(kind)
+    low, high = member.leaf.bounds()
+    low, high = (low - slack).ravel(), (high + slack).ravel()
+    low, high = (np.clip(each, float(least), float(most)) for each in (low, high))
+    if kind.kind != "f":  # in Python's integers: the largest of 64 bits are no doubles
+        whole = [map(math.ceil, low.tolist()), map(math.floor, high.tolist())]
+        ends = [[min(max(value, int(least)), int(most)) for value in each] for each in whole]
         return np.array(ends[0], kind), np.array(ends[1], kind)
-    largest = float(np.finfo(member.dtype).max)
-    low, high = np.maximum(low, -largest), np.minimum(high, largest)
-    down, up = low.astype(member.dtype), high.astype(member.dtype)
-    infinity = member.dtype.type(np.inf)
-    down = np.where(down.astype(np.float64) < low, np.nextafter(down, infinity), down)
-    up = np.where(up.astype(np.float64) > high, np.nextafter(up, -infinity), up)
-    return down.astype(member.dtype), up.astype(member.dtype)
+    down, up = low.astype(kind), high.astype(kind)
+    down = np.where(down.astype(np.float64) < low, np.nextafter(down, kind.type(np.inf)), down)
+    up = np.where(up.astype(np.float64) > high, np.nextafter(up, kind.type(-np.inf)), up)
+    return down, up

@@ -1,13 +1,13 @@
 """ONNX graph of one observation: every shape known, constants folded, branches chosen, dead nodes dropped.
 
-onnxruntime itself computes what is constant and how large everything is: the graph is run once on a batch of one, with
-every intermediate value as an output. So no operator needs a shape rule here.
+onnxruntime itself does this: with a batch of one, its simplified graph has no operator left that computes a size. It
+then runs the graph once with every intermediate value as an output, so no operator needs a shape rule here.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 import onnx
 from numpy.typing import NDArray
-from onnx import helper
+from onnx import helper, numpy_helper
 
 from rlservo.export.contract.errors import UnsupportedError
 from rlservo.export.contract.ort_session import open_ort_session
-
-RANDOM = {"RandomNormal", "RandomUniform", "RandomNormalLike", "RandomUniformLike", "Multinomial", "Bernoulli"}
 
 
 @dataclass(frozen=True)
@@ -32,6 +30,8 @@ class Node:
     """Names of values; '' where an optional one is absent."""
     outputs: tuple[str, ...]
     attributes: Mapping[str, Any]
+    """Defaults included."""
+    proto: onnx.NodeProto
     opset: int
 
 
@@ -42,121 +42,62 @@ class StaticGraph:
     nodes: tuple[Node, ...]
     values: Mapping[str, NDArray[Any]]
     constants: Collection[str]
-    inputs: tuple[str, ...]
-    """Those that something reads."""
+
+
+def refused(op: str, why: str = "") -> UnsupportedError:
+    """Return the error for an operator that has no C."""
+    what = f"the operator {op} of the policy's graph cannot be compiled to C"
+    return UnsupportedError(f"{what}{f': {why}' if why else ''}", {"operator": op})
 
 
 def read_static_graph(model_bytes: bytes, outputs: Sequence[str], example: Mapping[str, NDArray[Any]]) -> StaticGraph:
     """Return the part of a serialized model that computes `outputs`, for the one observation in `example`.
 
     `example` has every input of the graph by name, each `[1, ...]`. Raises UnsupportedError for another domain's
-    operators, for branches and loops that depend on the observation, and for values that are no tensors.
+    operators and for values that are no tensors, as those of branches and loops that depend on the observation.
     """
     model = onnx.load_model_from_string(model_bytes)
-    if model.functions:
-        from onnx.inliner import inline_local_functions
-
-        model = inline_local_functions(model)
-    graph = model.graph
-    opset = next((entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")), 1)
-    initial = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in graph.initializer}
-    while True:
-        _keep_needed(graph, outputs)
-        values = {**_run_all(model, example), **initial, **example}
-        constants = _constants(graph, set(initial), set(example))
-        branch = next((node for node in graph.node if node.op_type == "If" and node.input[0] in constants), None)
-        if branch is None:
-            break
-        _inline(graph, branch, bool(values[branch.input[0]]))
-    nodes: list[Node] = []
-    for node in graph.node:
-        if all(name in constants for name in node.output if name):
-            continue
-        name = f"{node.domain}.{node.op_type}" if node.domain not in ("", "ai.onnx") else node.op_type
-        if name != node.op_type or not all(isinstance(values.get(out), np.ndarray) for out in node.output if out):
-            raise UnsupportedError(f"the operator {name} of the policy's graph cannot be compiled to C")
-        attributes = {one.name: helper.get_attribute_value(one) for one in node.attribute}
-        nodes.append(Node(name, tuple(node.input), tuple(node.output), attributes, opset))
-    read = {name for node in nodes for name in node.inputs} | set(outputs)
-    return StaticGraph(tuple(nodes), values, constants, tuple(name for name in example if name in read))
+    wanted = [output for output in model.graph.output if output.name in outputs]
+    del model.graph.output[:]
+    model.graph.output.extend(wanted)
+    for given in model.graph.input:
+        given.type.tensor_type.shape.dim[0].dim_value = 1
+    with tempfile.TemporaryDirectory(prefix="rlservo-") as folder:
+        file, simplified = Path(folder) / "policy.onnx", Path(folder) / "simplified.onnx"
+        onnx.save(model, str(file))
+        open_ort_session(file, simplified=simplified)
+        model = onnx.load(str(simplified))
+        kept = _needed(model.graph, outputs)
+        names = [name for node in kept for name in node.output if name]
+        del model.graph.output[:]
+        model.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
+        onnx.save(model, str(file))
+        ort_session = open_ort_session(file)
+    feed = {each.name: example[each.name] for each in ort_session.get_inputs()}
+    computed: Sequence[Any] = ort_session.run(names, feed) if names else []
+    constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
+    values = {**dict(zip(names, computed, strict=True)), **constants, **example}
+    opset = next((each.version for each in model.opset_import if each.domain in ("", "ai.onnx")), 1)
+    return StaticGraph(tuple(_node(each, values, opset) for each in kept), values, {"", *constants})
 
 
-def _keep_needed(graph: onnx.GraphProto, outputs: Sequence[str]) -> None:
-    """Drop the nodes that no wanted output depends on."""
+def _needed(graph: onnx.GraphProto, outputs: Sequence[str]) -> list[onnx.NodeProto]:
+    """Return the nodes that the outputs depend on."""
     needed, kept = set(outputs), []
     for node in reversed(graph.node):
         if not needed.isdisjoint(node.output):
-            needed.update(_read_by(node))
+            needed.update(node.input)
             kept.append(node)
-    del graph.node[:]
-    graph.node.extend(reversed(kept))
+    return kept[::-1]
 
 
-def _read_by(node: onnx.NodeProto) -> Iterator[str]:
-    yield from node.input
-    for attribute in node.attribute:
-        for inner in (attribute.g, *attribute.graphs):
-            yield from (output.name for output in inner.output)
-            for other in inner.node:
-                yield from _read_by(other)
-
-
-def _run_all(model: onnx.ModelProto, example: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return every node's outputs for the example."""
-    names = [name for node in model.graph.node for name in node.output if name]
-    probe = onnx.ModelProto()
-    probe.CopyFrom(model)
-    del probe.graph.output[:]
-    probe.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
-    with tempfile.TemporaryDirectory(prefix="rlservo-") as folder:
-        file = Path(folder) / "probe.onnx"
-        onnx.save(probe, str(file))
-        ort_session = open_ort_session(file)
-    feed = {node.name: example[node.name] for node in ort_session.get_inputs()}
-    computed: Sequence[Any] = ort_session.run(names, feed) if names else []
-    return dict(zip(names, computed, strict=True))
-
-
-def _constants(graph: onnx.GraphProto, initial: set[str], inputs: set[str]) -> set[str]:
-    """Return the values that are the same for every observation; sizes are, with a batch of one."""
-    constants = {""} | (initial - inputs)
-    for node in graph.node:
-        sized = node.op_type in ("Shape", "Size")
-        if node.op_type not in RANDOM and (sized or all(name in constants for name in _read_outside(node))):
-            constants.update(node.output)
-    return constants
-
-
-def _read_outside(node: onnx.NodeProto) -> set[str]:
-    """Return what a node reads that it does not make itself, in the graphs inside it."""
-    made = {
-        name
-        for attribute in node.attribute
-        for inner in (attribute.g, *attribute.graphs)
-        for other in inner.node
-        for name in other.output
+def _node(node: onnx.NodeProto, values: Mapping[str, Any], opset: int) -> Node:
+    foreign = node.domain not in ("", "ai.onnx")
+    if foreign or not all(isinstance(values[name], np.ndarray) for name in node.output if name):
+        raise refused(f"{node.domain}.{node.op_type}" if foreign else node.op_type)
+    known = onnx.defs.get_schema(node.op_type, opset).attributes.values()
+    attributes = {
+        each.name: helper.get_attribute_value(each.default_value) for each in known if each.default_value.name
     }
-    return set(_read_by(node)) - made
-
-
-def _inline(graph: onnx.GraphProto, branch: onnx.NodeProto, chosen: bool) -> None:
-    """Put the nodes of the branch that is always taken in the place of an If."""
-    inner = next(one.g for one in branch.attribute if one.name == ("then_branch" if chosen else "else_branch"))
-    position = list(graph.node).index(branch)
-    made = {name for node in inner.node for name in node.output}
-    names = {name: f"{branch.output[0]}/{name}" for name in made}
-    nodes: list[onnx.NodeProto] = []
-    for tensor in inner.initializer:
-        nodes.append(helper.make_node("Constant", [], [f"{branch.output[0]}/{tensor.name}"], value=tensor))
-        names[tensor.name] = f"{branch.output[0]}/{tensor.name}"
-    for node in inner.node:
-        copy = onnx.NodeProto()
-        copy.CopyFrom(node)
-        copy.input[:] = [names.get(name, name) for name in node.input]
-        copy.output[:] = [names.get(name, name) for name in node.output]
-        nodes.append(copy)
-    for inside, outside in zip(inner.output, branch.output, strict=True):
-        nodes.append(helper.make_node("Identity", [names.get(inside.name, inside.name)], [outside]))
-    kept = [*list(graph.node)[:position], *nodes, *list(graph.node)[position + 1 :]]
-    del graph.node[:]
-    graph.node.extend(kept)
+    attributes |= {each.name: helper.get_attribute_value(each) for each in node.attribute}
+    return Node(node.op_type, tuple(node.input), tuple(node.output), attributes, node, opset)

@@ -10,11 +10,12 @@ if TYPE_CHECKING:
     import onnxruntime
 
 
-def open_ort_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSession:
+def open_ort_session(file: Path, threads: int = 1, simplified: Path | None = None) -> onnxruntime.InferenceSession:
     """Return a session on the CPU with this number of threads; one is fastest for networks of a policy's size.
 
     The file is not needed afterwards. A graph can make onnxruntime read further files from the file's folder: one of
-    unknown origin is opened as `Bundle.verified_copy`, which is in no folder.
+    unknown origin is opened as `Bundle.verified_copy`, which is in no folder. `simplified` is a file for the graph as
+    onnxruntime simplifies it within ONNX's own operators.
 
     Raises onnxruntime's own exceptions, which share no base but Exception.
     """
@@ -28,6 +29,9 @@ def open_ort_session(file: Path, threads: int = 1) -> onnxruntime.InferenceSessi
     options.inter_op_num_threads = 1
     options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
     options.log_severity_level = 4  # errors arrive as exceptions; onnxruntime would print them as well
+    if simplified is not None:
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        options.optimized_model_filepath = str(simplified)
     # A second thread spinning for work burns a core that a robot's control loop wants.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # From the path: from bytes onnxruntime 1.31 parses with the interpreter's lock held (0.3 s for 200 MB, during

@@ -5,6 +5,7 @@ Each kind of command runs in a process of its own once, the others in this one (
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 import subprocess
@@ -21,6 +22,7 @@ from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.export.contract.bundle import load_bundle, read_contract
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.spaces import BoxSpec, Element
+from rlservo.serve_app.runtime.compiled_policy import CompiledPolicy
 from rlservo.serve_app.runtime.policy import Policy
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -146,6 +148,59 @@ def test_verify_measures_disturbances_and_writes_them_into_the_contract(bundle: 
     assert rlservo_here("inspect", bundle).returncode == 0
     with Policy.load(bundle) as policy:  # a server's check of the copy inside the graph
         assert policy.contract.evaluations == evaluations
+
+
+@pytest.fixture(scope="module")
+def compiled(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The policy as C. Not to be written to."""
+    if shutil.which("cc") is None:
+        pytest.skip("there is no C compiler")
+    folder = tmp_path_factory.mktemp("compiled") / "c"
+    done = rlservo_here("compile", policies, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    assert "µs for the slowest observation" in done.stdout and "bytes stack" in done.stdout
+    return folder
+
+
+REACH = ("--env", "rlservo/EndEffectorPositioningURSim-v0", "--episodes", 2)
+
+
+def test_verify_drives_bundle_and_c_to_the_same_endings(policies: Path, compiled: Path) -> None:
+    done = rlservo_here("verify", policies, "--compiled", compiled, *REACH, "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)["compiled"]
+    assert (document["episodes"], sum(document["endings"].values())) == (2, 2)
+    assert document["max_return_difference"] < 1e-3
+
+
+def test_verify_finds_c_that_ends_otherwise(policies: Path, compiled: Path, tmp_path: Path) -> None:
+    """As a weight that was changed after the proof: the hashes fit, the arm stands still."""
+    copy = shutil.copytree(compiled, tmp_path / "c")
+    source = (copy / "ur5.c").read_text()
+    (copy / "ur5.c").write_text(
+        source.replace("    return notice;", "    memset(action, 0, sizeof *action);\n    return 0;")
+    )
+    subprocess.run(
+        ["cc", "-std=c99", "-O1", "-shared", "-fPIC", "ur5.c", "-o", "libur5.so", "-lm"], cwd=copy, check=True
+    )
+    about = json.loads((copy / "compile.json").read_text())
+    about["files"]["libur5.so"] = hashlib.sha256((copy / "libur5.so").read_bytes()).hexdigest()
+    (copy / "compile.json").write_text(json.dumps(about))
+    done = rlservo_here("verify", policies, "--compiled", copy, *REACH)
+    refused(done, 1, "episode 0 (seed 0) ends otherwise: with the bundle 'success' after ", "with its C '")
+
+
+def test_rollout_replay_and_the_cockpit_drive_the_compiled_policy(compiled: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run.mcap"
+    done = rlservo_here("rollout", *REACH[1:], "--bundle", compiled, "--seed", 0, "--record", run, "--json")
+    assert done.returncode == 0, done.stderr
+    done = rlservo_here("replay", run, "--bundle", compiled, "--json")
+    assert done.returncode == 0, done.stdout + done.stderr  # no action would change
+    assert json.loads(done.stdout)["compared"] > 0
+    from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link
+
+    with BundledPolicies(compiled).open(Choice("ur5", "1"), Link()) as policy:
+        assert isinstance(policy, CompiledPolicy)
 
 
 @pytest.mark.parametrize(

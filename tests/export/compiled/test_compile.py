@@ -40,7 +40,10 @@ def test_the_proof_and_its_figures_stand_in_compile_json(compiled_ur5: Compiled)
     assert about["proof"]["golden_vectors"] == 8
     assert about["proof"]["observations"] == 10_000
     assert 0 < about["proof"]["max_rel"] < 1
-    assert 0 < about["proof"]["step_us"]["median"] <= about["proof"]["step_us"]["longest"]
+    assert 0 <= about["proof"]["rounding_used"] < 100 and 0 <= about["proof"]["rounding_most"] < 10
+    times = about["proof"]["step_us"]
+    assert 0 < times["median"] <= times["longest"] and 0 < times["slowest_observation"] <= times["longest"]
+    assert 0 < about["proof"]["stack_bytes"] < 1000
     assert about["proof"]["code_bytes"] < 400_000  # weights and all
     assert set(SOURCES) < set(about["files"])
 
@@ -144,10 +147,14 @@ ZOO = ("act_nested", "stacked", "image", "user_gru", "obs_multi_discrete", "lstm
 def test_policies_of_every_kind_act_as_in_onnxruntime(
     wide_zoo: Path, exported: Callable[..., ExportResult], tmp_path: Path, name: str
 ) -> None:
-    """Nested spaces, memories, images, choices: an episode of each, on the golden observations."""
+    """Nested spaces, memories, images, choices: an episode of each, and its self-test under sanitizers."""
     bundle = exported(wide_zoo / name).path
     made = compile_bundle(bundle, tmp_path / "c")
     assert made.proof is not None and made.proof.max_rel < 1
+    sources = [made.folder / f"{made.about['prefix']}{end}" for end in (".c", "_test.c")]
+    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    subprocess.run(["cc", "-std=c99", *proof.WARNINGS, *sanitizers, *sources, "-o", tmp_path / "t", "-lm"], check=True)
+    subprocess.run([tmp_path / "t"], check=True, capture_output=True)
     with Policy.load(bundle) as policy, CompiledPolicy(made.folder) as compiled:
         inputs = dict(policy_inputs(policy).items())
         state = other = None
