@@ -115,7 +115,7 @@ def main() -> None:
             document[checkpoint] = {side: min(each[side] for each in rounds) for side in measured}
             ratios = {side: float(np.median([each[side] / each["C"] for each in rounds])) for side in measured}
             document[checkpoint] |= {"as_multiple_of_C": ratios, "proof": made.about["proof"]}
-        for side in measured:
+        for side in document[CHECKPOINTS[0]]["as_multiple_of_C"]:
             figures = [(document[name][side], document[name]["as_multiple_of_C"][side]) for name in CHECKPOINTS]
             table.add_row(side, *(f"{time:.1f} ({ratio:.1f} x)" for time, ratio in figures))
         for what in ("slowest_observation", "longest"):

@@ -237,22 +237,25 @@ def _around(shape: Sequence[int], axes: Sequence[int]) -> tuple[int, int, int]:
 
 
 def _along(program: Program, node: Node) -> None:
-    value, given, scale = program.value(node.inputs[0]), node.attributes, ""
+    data, *others = node.inputs
+    value, given, scale = program.value(data), node.attributes, ""
     if node.op.startswith("Reduce"):  # an attribute, or since opset 13 or 18 an operand
-        named = program.value(node.inputs[1]).tolist() if len(node.inputs) > 1 else given.get("axes") or []
+        named = program.value(others[0]).tolist() if others else given.get("axes") or []
         axes = named or list(range(0 if given.get("noop_with_empty_axes") else value.ndim))
     else:
         axes = [int(given["axis"])]
     axes = sorted(axis % value.ndim for axis in axes)
     if node.op == "LayerNormalization":
         axes = list(range(axes[0], value.ndim))
-        scale = " + ".join(f"{program.ref(name)}[k]" for name in node.inputs[1:])
-    if not axes or axes != list(range(axes[0], axes[-1] + 1)) or not all(map(program.is_constant, node.inputs[1:])):
+        scale = " + ".join(f"{program.ref(name)}[k]" for name in others)
+    if not axes or axes != list(range(axes[0], axes[-1] + 1)) or not all(map(program.is_constant, others)):
         raise refused(node.op, "its axes are no neighbours, or computed")
     if (value.dtype.kind != "f" and node.op not in OF_INTEGERS) or (node.opset < 13 and "Softmax" in node.op):
         raise refused(node.op, f"of {value.dtype.name} values in opset {node.opset}")
     outer, n, inner = _around(value.shape, axes)
-    source, result = program.ref(node.inputs[0]), program.new(node.outputs[0])
+    if scale and (any(node.outputs[1:]) or any(program.value(name).size != n for name in others)):
+        raise refused(node.op, "its scale is not of its input's size, or its mean is an output")
+    source, result = program.ref(data), program.new(node.outputs[0])
     epsilon = number(value.dtype.type(given.get("epsilon", 0)))
     text = ALONG[node.op].format(f="f" if value.dtype == np.float32 else "", scale=scale, epsilon=epsilon)
     if given.get("select_last_index"):
