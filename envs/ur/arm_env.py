@@ -1,4 +1,4 @@
-"""Base of the arm's tasks: joints that may be fixed, a start pose, one command a cycle.
+"""Base of an arm's tasks: joints that may be fixed, a start pose, one command a cycle.
 
 A task adds what its action means, what it observes and how a step is judged. Source of every figure here:
 jr-robotics/robo-gym 2.0.1, envs/ur/ur_base_env.py.
@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -28,91 +28,69 @@ from rlservo.envs.checks import (
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
 from rlservo.envs.robots.arm import MUJOCO
 from rlservo.envs.robots.connect import make_arm
-from rlservo.envs.ur.model import BASE_HEIGHT
+from rlservo.envs.ur.model import BASE_HEIGHT, Table
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.envs.ur.server_state import state_dict
-from rlservo.envs.ur.simulation import VIEW
+from rlservo.envs.ur.simulation import VIEW, ArmSimulation, URSimulation
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 BASE: NDArray[np.float64] = np.array([0.0, 0.0, BASE_HEIGHT])  # [m], base_link in MuJoCo's world
 POSITION_BOUND = 1.1  # of a normalised joint position: its limit and robo-gym's tolerance
+REDRAWS = 1000  # of a random start that collides; about one in ten does
 
 Observation = NDArray[np.float32]
 Vector = NDArray[np.float64]
+Simulation = TypeVar("Simulation", bound=ArmSimulation)
 
 
-class URArmEnv(RenderedEnv):
-    """Move a UR arm by one command per joint and cycle; the tasks that derive from it hold the data sheets."""
+class ArmEnv(RenderedEnv, Generic[Simulation]):
+    """Move an arm by one command per joint and cycle; the tasks that derive from it hold the data sheets."""
 
     # Not a ClassVar: each instance states its own rate.
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
+    JOINTS: ClassVar[tuple[str, ...]]
+    LOW: ClassVar[Vector]  # [rad], of JOINTS
+    HIGH: ClassVar[Vector]
+    BASE: ClassVar[Vector]  # [m], the arm's base in MuJoCo's world
+    FIXED: ClassVar[tuple[str, ...]] = ()  # joints that are fixed where the constructor says nothing of them
     START_JOINTS: ClassVar[tuple[float, ...]]  # [rad]
     MAX_STEPS: ClassVar[int]
     RESET_OPTIONS: ClassVar[tuple[str, ...]]
     RS_MODE: ClassVar[str]  # content of `info["rs_state"]`
     OBJECTS: ClassVar[tuple[str, ...]]
-    TABLE: ClassVar[bool]
     ACTION_ELEMENT: ClassVar[tuple[str, str]]  # suffix of the joint's name, and unit
+    OBSERVES_LAST_ACTION: ClassVar[bool] = False  # an element for each free joint, at the end of the observation
     TIME_LIMIT_STATUS: ClassVar[str] = "success"  # the final status of an episode that lasts MAX_STEPS
     MAX_VELOCITY_SCALE: ClassVar[float] = 0.2
     RATE_HZ: ClassVar[float] = 20.0
 
     def __init__(
         self,
+        make_simulation: Callable[[], Simulation],
         *,
-        fix_base: bool = False,
-        fix_shoulder: bool = False,
-        fix_elbow: bool = False,
-        fix_wrist_1: bool = False,
-        fix_wrist_2: bool = False,
-        fix_wrist_3: bool = True,
-        ur_model: str = "ur5",
-        rs_state_to_info: bool = True,
-        gui: bool = False,
-        max_velocity_scale_factor: float | None = None,
-        action_cycle_rate: float | None = None,
-        render_mode: str | None = None,
-        robot: str = MUJOCO,
-        limits: Mapping[str, Any] | None = None,
-        confirm: bool = True,
-        metrics: str | None = None,
-        rs_address: str | None = None,
-        ip: str | None = None,
-        lower_bound_port: int | None = None,
-        upper_bound_port: int | None = None,
+        fixed: Sequence[bool],
+        rate_hz: float,
+        rs_state_to_info: bool,
+        gui: bool,
+        render_mode: str | None,
     ) -> None:
-        """The arguments are described in the tasks' docstrings; None takes the task's own value."""
-        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
-        fixed = np.array((fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3))
-        scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
-        rate_hz = self.RATE_HZ if action_cycle_rate is None else action_cycle_rate
-        if fixed.all():
-            raise ValueError("all six joints are fixed: no joint is left to act on")
+        if all(fixed):
+            raise ValueError(f"all {len(fixed)} joints are fixed: no joint is left to act on")
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
-        self._build = partial(
-            make_arm,
-            robot,
-            limits=limits,
-            confirm=confirm,
-            metrics=metrics,
-            max_velocity_scale=scale,
-            cycle_s=cycle_of(rate_hz),
-            objects=self.OBJECTS,
-            table=self.TABLE,
-        )
-        self.is_real = robot != MUJOCO
-        self._simulations = {ur_model: self._build(ur_model)}  # an arm that comes again is not built again
-        self.simulation = self._simulations[ur_model]
-        self._free = np.flatnonzero(~fixed)
+        self.simulation = make_simulation()
+        self._free = np.flatnonzero(~np.array(fixed))
         self._fixed = np.flatnonzero(fixed)
         self._rs_state_to_info = rs_state_to_info
-        self._elements = self._action_elements(fixed.tolist())
+        self._elements = self._action_elements(fixed)
 
         low, high = self._observation_bounds()
         self.observation_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
-        self._actions = gym.spaces.Box(-1.0, 1.0, (len(self._free),), dtype=np.float32)
+        low, high = self._action_bounds()
+        self._actions = gym.spaces.Box(
+            low[self._free].astype(np.float32), high[self._free].astype(np.float32), dtype=np.float32
+        )
         self.action_space = self._actions
 
         self._camera = Camera(self.simulation.model, self.simulation.data, **VIEW)
@@ -123,9 +101,14 @@ class URArmEnv(RenderedEnv):
     @classmethod
     def describe(cls, *, action_cycle_rate: float | None = None, **arguments: Any) -> EnvDescription:
         """Name the elements for the constructor arguments given, without building a simulator."""
-        fixed = [bool(arguments.get(f"fix_{joint}", joint == "wrist_3")) for joint in JOINTS]
+        choices = [arguments.get(f"fix_{joint}") for joint in cls.JOINTS]
+        fixed = cls._fixed_joints(choices)
+        elements = cls._observation_elements()
+        if cls.OBSERVES_LAST_ACTION:
+            free = [joint for joint, is_fixed in zip(cls.JOINTS, fixed, strict=True) if not is_fixed]
+            elements += [(f"{joint}_last_action", "1") for joint in free]
         return {
-            "observation": [element(name, unit) for name, unit in cls._observation_elements()],
+            "observation": [element(name, unit) for name, unit in elements],
             "action": cls._action_elements(fixed),
             "control_rate_hz": cls.RATE_HZ if action_cycle_rate is None else action_cycle_rate,
         }
@@ -147,7 +130,7 @@ class URArmEnv(RenderedEnv):
         """Command the joints, let one cycle pass, and judge the outcome."""
         values = check_action(action, self._actions, self._elements)
         self._steps += 1
-        command = np.empty(6)  # all joints
+        command = np.empty(len(self.JOINTS))
         command[self._free] = values
         command[self._fixed] = self._fixed_values()[self._fixed]
         self.simulation.command(self._to_joint_positions(command))
@@ -164,33 +147,17 @@ class URArmEnv(RenderedEnv):
         if status is not None:
             info = {"final_status": status, "is_success": status == "success", **self._final_info(status)}
         if self._rs_state_to_info:
-            info["rs_state"] = state_dict(self.simulation, self.RS_MODE)
+            info["rs_state"] = self._rs_state()
         if (robot := self.simulation.robot_info()) is not None:
             info["robot"] = robot
         self._refresh_window()
         return observation, reward, terminated, truncated, info
-
-    def close(self) -> None:
-        """Free the GL context, close the window, and stop a real arm."""
-        for simulation in self._simulations.values():
-            simulation.close()
-        super().close()
 
     def limited(self) -> dict[str, int] | None:
         """Return the number of command cycles in which each limit of a real arm applied; None for a simulated arm."""
         return self.simulation.limited()
 
     # -- for disturbances
-
-    def set_robot_model(self, name: str) -> None:
-        """Put another arm on the table; call `reset` next. Raises ValueError naming the seven, and for a real arm."""
-        if self.is_real:
-            raise ValueError(f"a real arm cannot be exchanged for {name!r}")
-        simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
-        if simulation is not self.simulation:
-            self.simulation = simulation
-            self._camera.close()
-            self._camera = Camera(simulation.model, simulation.data, **VIEW)
 
     def set_base_offset(self, offset: tuple[float, float]) -> None:
         """Report positions of objects that are wrong by `offset` (x, y) [m]: the base is not where it was measured."""
@@ -203,20 +170,25 @@ class URArmEnv(RenderedEnv):
 
     # -- for viewers
 
-    def take_over(self) -> None:
-        """Let a person lead a real arm by hand, or give it back. Raises ValueError for a simulated one."""
-        self.simulation.take_over()
-
     def robot_position(self) -> Vector:
-        """Return tool0's position in MuJoCo's world [m] (3,)."""
-        return self.simulation.tool_position + BASE
+        """Return the tool's position in MuJoCo's world [m] (3,)."""
+        return self.simulation.tool_position + self.BASE
 
     def start_at(self, position: ArrayLike) -> dict[str, Any]:
-        """Return the options of an episode that starts with tool0 there, or as near as the arm gets from here."""
-        joints = self.simulation.joints_towards(as_vector("position", position, 3) - BASE)
-        return {"joint_positions": np.clip(joints, -LIMITS, LIMITS).tolist()}
+        """Return the options of an episode that starts with the tool there, or as near as the arm gets from here."""
+        joints = self.simulation.joints_towards(as_vector("position", position, 3) - self.BASE)
+        return {"joint_positions": np.clip(joints, self.LOW, self.HIGH).tolist()}
 
-    # -- what a task adds
+    # -- what an arm and a task add
+
+    @abstractmethod
+    def _rs_state(self) -> dict[str, float]:
+        """Return the state as the robot server's mode RS_MODE has it."""
+
+    def _action_bounds(self) -> tuple[Vector, Vector]:
+        """Return the action's low and high, (joints,)."""
+        one = np.ones(len(self.JOINTS))
+        return -one, one
 
     @classmethod
     @abstractmethod
@@ -233,11 +205,11 @@ class URArmEnv(RenderedEnv):
 
     @abstractmethod
     def _fixed_values(self) -> Vector:
-        """Return the action elements of fixed joints, (6,)."""
+        """Return the action elements of fixed joints, (joints,)."""
 
     @abstractmethod
     def _to_joint_positions(self, command: Vector) -> Vector:
-        """Turn an action of all six joints into joint positions [rad]."""
+        """Turn an action of all joints into joint positions [rad]."""
 
     @abstractmethod
     def _observation(self) -> Observation:
@@ -257,10 +229,19 @@ class URArmEnv(RenderedEnv):
     # -- parts
 
     @classmethod
+    def _fixed_joints(cls, choices: Sequence[bool | None]) -> list[bool]:
+        return [
+            joint in cls.FIXED if is_fixed is None else is_fixed
+            for joint, is_fixed in zip(cls.JOINTS, choices, strict=True)
+        ]
+
+    @classmethod
     def _action_elements(cls, fixed: Sequence[bool]) -> list[ElementInfo]:
         """Name the elements of an action: one for each joint that is not fixed."""
         name, unit = cls.ACTION_ELEMENT
-        return [element(f"{joint}_{name}", unit) for joint, is_fixed in zip(JOINTS, fixed, strict=True) if not is_fixed]
+        return [
+            element(f"{joint}_{name}", unit) for joint, is_fixed in zip(cls.JOINTS, fixed, strict=True) if not is_fixed
+        ]
 
     def _place_arm(self, options: Mapping[str, Any]) -> Vector:
         """Put the arm at the options' start and return it."""
@@ -268,19 +249,116 @@ class URArmEnv(RenderedEnv):
         return self._place_arm_at(np.array(self.START_JOINTS) if values is None else self._check_joints(values))
 
     def _check_joints(self, values: Any) -> Vector:
-        joints = as_vector("joint_positions", values, 6)
-        for joint, position, limit in zip(JOINTS, joints, POSITION_LIMITS, strict=True):
-            if abs(position) > limit:
+        joints = as_vector("joint_positions", values, len(self.JOINTS))
+        for joint, position, low, high in zip(self.JOINTS, joints, self.LOW, self.HIGH, strict=True):
+            if not low <= position <= high:
+                within = f"+-{high:g}" if low == -high else f"{low:g} .. {high:g}"
                 raise InvalidResetError(
-                    f"reset option 'joint_positions': {joint} is {position:g} rad, expected within +-{limit:g} rad"
+                    f"reset option 'joint_positions': {joint} is {position:g} rad, expected within {within} rad"
                 )
         return joints
+
+    def _place_arm_around(self, centre: Vector, spread: float | Sequence[float]) -> Vector:
+        """Put the arm within `spread` [rad] of `centre`, redrawn while it collides."""
+        reach: Vector = np.broadcast_to(np.array(spread), centre.shape)
+        for _ in range(REDRAWS):
+            draw = self.np_random.uniform(centre - reach, centre + reach)
+            joints: Vector = np.clip(draw, self.LOW, self.HIGH)
+            if not self.simulation.place(joints):
+                return joints
+        raise InvalidResetError(f"all {REDRAWS} random starts around the given joint positions collide")
 
     def _place_arm_at(self, joints: Vector) -> Vector:
         if self.simulation.place(joints):
             links = " and ".join(self.simulation.contacts()[0])
             raise InvalidResetError(f"the start joint positions collide: {links} touch")
         return joints
+
+
+class URArmEnv(ArmEnv[URSimulation]):
+    """Move a UR arm, simulated or real."""
+
+    JOINTS = JOINTS
+    LOW, HIGH = -LIMITS, LIMITS
+    BASE = BASE
+    FIXED: ClassVar[tuple[str, ...]] = ("wrist_3",)
+    TOOL: ClassVar[str] = "tool0"
+    TABLE: ClassVar[Table]
+
+    def __init__(
+        self,
+        *,
+        fix_base: bool | None = None,
+        fix_shoulder: bool | None = None,
+        fix_elbow: bool | None = None,
+        fix_wrist_1: bool | None = None,
+        fix_wrist_2: bool | None = None,
+        fix_wrist_3: bool | None = None,
+        ur_model: str = "ur5",
+        rs_state_to_info: bool = True,
+        gui: bool = False,
+        max_velocity_scale_factor: float | None = None,
+        action_cycle_rate: float | None = None,
+        render_mode: str | None = None,
+        robot: str = MUJOCO,
+        limits: Mapping[str, Any] | None = None,
+        confirm: bool = True,
+        metrics: str | None = None,
+        rs_address: str | None = None,
+        ip: str | None = None,
+        lower_bound_port: int | None = None,
+        upper_bound_port: int | None = None,
+    ) -> None:
+        """The arguments are described in the tasks' docstrings; None takes the task's own value."""
+        del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
+        choices = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
+        scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
+        rate_hz = self.RATE_HZ if action_cycle_rate is None else action_cycle_rate
+        self._build = partial(
+            make_arm,
+            robot,
+            limits=limits,
+            confirm=confirm,
+            metrics=metrics,
+            max_velocity_scale=scale,
+            cycle_s=cycle_of(rate_hz),
+            objects=self.OBJECTS,
+            table=self.TABLE,
+            tool=self.TOOL,
+        )
+        self.is_real = robot != MUJOCO
+        super().__init__(
+            partial(self._build, ur_model),
+            fixed=self._fixed_joints(choices),
+            rate_hz=rate_hz,
+            rs_state_to_info=rs_state_to_info,
+            gui=gui,
+            render_mode=render_mode,
+        )
+        self._simulations = {ur_model: self.simulation}  # an arm that comes again is not built again
+
+    def close(self) -> None:
+        """Free the GL context, close the window, and stop a real arm."""
+        for simulation in self._simulations.values():
+            simulation.close()
+        super().close()
+
+    def set_robot_model(self, name: str) -> None:
+        """Put another arm on the table; call `reset` next. Raises ValueError naming the seven, and for a real arm."""
+        if self.is_real:
+            raise ValueError(f"a real arm cannot be exchanged for {name!r}")
+        simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
+        if simulation is not self.simulation:
+            self.simulation = simulation
+            self._camera.close()
+            self._camera = Camera(simulation.model, simulation.data, **VIEW)
+
+    def take_over(self) -> None:
+        """Let a person lead a real arm by hand, or give it back. Raises ValueError for a simulated one."""
+        self.simulation.take_over()
+
+    def _rs_state(self) -> dict[str, float]:
+        return state_dict(self.simulation, self.RS_MODE)
 
 
 def polar(point: Vector) -> tuple[float, float, float]:

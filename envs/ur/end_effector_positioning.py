@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlservo.envs.checks import InvalidResetError, as_vector
 from rlservo.envs.disturbances import Extreme, SensorError
 from rlservo.envs.rendering import Start
-from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
+from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, REDRAWS, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.parameters import JOINTS
 from rlservo.envs.ur.sensor_errors import joint_errors, polar_errors, position_errors, velocity_errors
 
@@ -20,7 +20,6 @@ START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
 START_RANGE = (1.5, 0.25, 0.5, 1.0, 0.4, 3.14)  # [rad], +-, with randomize_start
 WRIST_1_RANGE = (-3.48, 0.31)  # [rad], with restrict_wrist_1
 SUCCESS_DISTANCE = 0.1  # [m]
-REDRAWS = 1000  # of a random start that collides; about one in ten does
 # A start in a corner: any joints in this range [rad] that bring the tool near the base's axis or the table.
 CORNER_LOW = (-math.pi, -math.pi, -2.8, -math.pi, -math.pi, 0.0)
 CORNER_HIGH = (math.pi, 0.0, 2.8, math.pi, math.pi, 0.0)
@@ -200,12 +199,7 @@ class EndEffectorPositioningURSim(URArmEnv):
         centre = self._check_joints(centre)
         if not randomize:
             return self._place_arm_at(centre)
-        for _ in range(REDRAWS):
-            draw = self.np_random.uniform(centre - START_RANGE, centre + START_RANGE)
-            joints: Vector = np.clip(draw, -LIMITS, LIMITS)
-            if not self.simulation.place(joints):
-                return joints
-        raise InvalidResetError(f"all {REDRAWS} random starts around the given joint positions collide")
+        return self._place_arm_around(centre, START_RANGE)
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         self._previous_action = np.zeros(6)

@@ -41,14 +41,15 @@ def state_names(rs_mode: str) -> list[str]:
     mode = rs_mode_of(rs_mode)
     joints = [JOINTS[index] for index in ROS_ORDER]
     return [
-        *(name for index in range(mode.objects) for name in _transform_names(f"object_{index}")),
+        *(name for index in range(mode.objects) for name in transform_names(f"object_{index}")),
         *(f"{joint}_joint_{quantity}" for quantity in ("position", "velocity") for joint in joints),
-        *_transform_names("ee"),
+        *transform_names("ee"),
         "in_collision",
-        *(_transform_names("forearm") if mode.forearm else ()),
+        *(transform_names("forearm") if mode.forearm else ()),
     ]
 
 
-def _transform_names(frame: str) -> list[str]:
+def transform_names(frame: str) -> list[str]:
+    """Return the names of a frame's position and quaternion in the reference frame."""
     elements = [*(f"translation_{axis}" for axis in "xyz"), *(f"rotation_{axis}" for axis in "xyzw")]
     return [f"{frame}_to_ref_{element}" for element in elements]

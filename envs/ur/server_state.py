@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.envs.ur.rs_modes import ROS_ORDER, rs_mode_of, state_names
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.envs.ur.simulation import ArmSimulation, URSimulation
 
 Vector = NDArray[np.float64]
 Transform = tuple[float, float, float, float, float, float, float]  # x, y, z [m], quaternion x, y, z, w
@@ -21,23 +21,25 @@ def state_dict(arm: URSimulation, rs_mode: str, *, is_turned: bool = False) -> d
     mode = rs_mode_of(rs_mode)
     values: list[float] = []
     for index in range(mode.objects):
-        values += _object(arm, index, is_turned)
+        values += object_transform(arm, index, is_turned)
     for joints in (arm.joint_positions.tolist(), arm.joint_velocities.tolist()):
         values += [joints[index] for index in ROS_ORDER]
-    values += _transform(arm.tool_position, arm.tool_rotation, is_turned)
+    values += transform(arm.tool_position, arm.tool_rotation, is_turned)
     values.append(float(arm.in_collision))
     if mode.forearm:
-        values += _transform(arm.forearm_position, arm.forearm_rotation, is_turned)
+        values += transform(arm.forearm_position, arm.forearm_rotation, is_turned)
     return dict(zip(state_names(rs_mode), values, strict=True))
 
 
-def _object(arm: URSimulation, index: int, is_turned: bool) -> Transform:
+def object_transform(arm: ArmSimulation, index: int, is_turned: bool = False) -> Transform:
+    """Return where an object is, in base_link or the controller's `base`."""
     x, y, z = arm.object_position(index).tolist()
     # Objects are placed in the reference frame and never turn in it.
     return (-x, -y, z, 0.0, 0.0, 0.0, 1.0) if is_turned else (x, y, z, 0.0, 0.0, 0.0, 1.0)
 
 
-def _transform(position: Vector, rotation: Vector, is_turned: bool) -> Transform:
+def transform(position: Vector, rotation: Vector, is_turned: bool = False) -> Transform:
+    """Return a pose in base_link, or as it is in the controller's `base`."""
     quaternion = np.empty(4)
     mujoco.mju_mat2Quat(quaternion, rotation.reshape(9))
     w, x, y, z = quaternion.tolist()

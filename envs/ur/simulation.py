@@ -1,8 +1,8 @@
-"""The simulated arm: place it, command joint positions, let a control cycle pass, read positions.
+"""Simulated arms: place one, command joint positions, let a control cycle pass, read positions.
 
-It follows robo-gym's robot server: a command becomes a one-point joint trajectory, and the next command replaces it;
+They follow robo-gym's robot server: a command becomes a one-point joint trajectory, and the next command replaces it;
 objects stand or move along paths. The Gymnasium environments and the robot server both run on it. Poses are in
-`base_link`, which stands unrotated on the table.
+the frame of the arm's base, which stands unrotated: `base_link` of a UR.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.disturbances import MAX_MODEL_ERROR
 from rlservo.envs.robots.arm import ArmState
-from rlservo.envs.ur.model import BASE_HEIGHT, TIMESTEP, build_model
+from rlservo.envs.ur.model import BASE_HEIGHT, TIMESTEP, Table, build_model
 from rlservo.envs.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.envs.ur.parameters import JOINTS, ur_parameters
 
@@ -30,7 +30,9 @@ VIEW: dict[str, Any] = {"lookat": (0.0, 0.05, 0.42), "distance": 2.3, "azimuth":
 
 # Of `joints_towards`.
 REACH_STEPS = 60
-REACH_STEP = 0.05  # [m], of tool0 at once
+REACH_STEP = 0.05  # [m], of the tool at once
+REACH_TURN = 0.2  # [rad]
+REACHED = 1e-6  # [m], and [rad]
 REACH_DAMPING = 0.05  # [m], keeps the joints calm when the arm is stretched
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")  # the moving links
@@ -42,51 +44,63 @@ Vector = NDArray[np.float64]
 class _DataSheet(NamedTuple):
     """The model's figures as built, from which a model error is drawn."""
 
-    max_velocity: Vector  # [rad/s], (6,)
+    max_velocity: Vector  # [rad/s], (joints,)
     masses: Vector  # [kg], LINKS
     inertias: Vector  # [kg m^2], (6, 3)
     gains: Vector  # of the actuators, by MuJoCo's parameters
     biases: Vector
 
 
-class URSimulation:
-    """One arm on its table, at 200 Hz physics, or the next higher rate with a whole number of steps per control cycle.
+class _Limits(Protocol):
+    """An arm's limits, by joint."""
+
+    @property
+    def velocity_limits(self) -> tuple[float, ...]: ...
+    @property
+    def effort_limits(self) -> tuple[float, ...]: ...
+
+
+class ArmSimulation:
+    """One arm and its scene, at 200 Hz physics, or the next higher rate with a whole number of steps per control cycle.
 
     `max_velocity_scale` multiplies the arm's joint velocity limits, as the robot server's parameter of that name.
-    `objects` are names of `OBJECT_MODELS`. Without `table` the arm stands 0.1 m above bare ground.
+    `model` has an actuator and a `<joint>_velocity` for each of JOINTS, bodies LINKS, payload and `object_<i>`, and a
+    site `tool`, which is the end effector.
     """
+
+    JOINTS: ClassVar[tuple[str, ...]]
+    LINKS: ClassVar[tuple[str, ...]]  # bodies that move
+    BASE_HEIGHT: ClassVar[float]  # [m], of the arm's base in MuJoCo's world
 
     def __init__(
         self,
-        ur_model: str = "ur5",
+        parameters: _Limits,
+        model: mujoco.MjModel,
         *,
-        max_velocity_scale: float = 0.1,
-        cycle_s: float = 0.1,
-        objects: Sequence[str] = ("sphere50_no_collision",),
-        table: bool = True,
+        tool: str,
+        max_velocity_scale: float,
+        cycle_s: float,
+        object_count: int,
     ) -> None:
-        self.parameters = ur_parameters(ur_model)
         if not 0.0 < max_velocity_scale <= 1.0:
             raise ValueError(f"max_velocity_scale_factor is {max_velocity_scale:g}: expected more than 0, at most 1")
-        self.model: mujoco.MjModel = build_model(self.parameters, objects=objects, table=table)
+        self.model: mujoco.MjModel = model
         self.data = mujoco.MjData(self.model)
-        self.max_velocity = max_velocity_scale * np.array(self.parameters.velocity_limits)  # [rad/s], (6,)
+        self._effort_limits = parameters.effort_limits
+        self.max_velocity = max_velocity_scale * np.array(parameters.velocity_limits)  # [rad/s], (joints,)
         self._substeps = math.ceil(cycle_s / TIMESTEP - 1e-9)
         if abs(self._substeps * TIMESTEP - cycle_s) > 1e-9:
             self.model.opt.timestep = cycle_s / self._substeps
-        self._servo = np.array([self.data.actuator(name).id for name in JOINTS])
-        self._feed_forward = np.array([self.data.actuator(f"{name}_velocity").id for name in JOINTS])
-        self._tool = self.model.site("tool0").id
-        self._forearm = self.model.body("forearm").id
+        self._servo = np.array([self.data.actuator(name).id for name in self.JOINTS])
+        self._feed_forward = np.array([self.data.actuator(f"{name}_velocity").id for name in self.JOINTS])
+        self._tool = self.model.site(tool).id
         self._tool_xpos = self.data.site_xpos[self._tool]  # views that stay valid: MjData never moves
         self._tool_xmat = self.data.site_xmat[self._tool]
-        self._forearm_xpos = self.data.xpos[self._forearm]
-        self._forearm_xmat = self.data.xmat[self._forearm]
-        self._objects = [int(self.model.body(f"object_{index}").mocapid[0]) for index in range(len(objects))]
+        self._objects = [int(self.model.body(f"object_{index}").mocapid[0]) for index in range(object_count)]
         self._moving: dict[int, Path] = {}  # by mocap index, in the world
         self._tick = 0  # substeps since the objects' paths began
         self._payload = self.model.body("payload").id
-        self._links = np.array([self.model.body(name).id for name in LINKS])
+        self._links = np.array([self.model.body(name).id for name in self.LINKS])
         self._data_sheet = _DataSheet(
             self.max_velocity.copy(),
             self.model.body_mass[self._links].copy(),
@@ -95,7 +109,7 @@ class URSimulation:
             self.model.actuator_biasprm.copy(),
         )
         self._trial: Any = None  # MjData for what nothing of the scene may move
-        self._velocity: Vector = np.zeros(6)  # [rad/s], of the trajectory that is being executed
+        self._velocity: Vector = np.zeros(len(self.JOINTS))  # [rad/s], of the trajectory that is being executed
         self._remaining = 0  # substeps until that trajectory arrives
         self.in_collision = False
 
@@ -122,7 +136,7 @@ class URSimulation:
     # -- placing
 
     def place(self, joint_positions: ArrayLike) -> bool:
-        """Put the arm at rest at `joint_positions` [rad] (6,), objects out of the way. Return whether it collides."""
+        """Put the arm at rest at positions [rad] (joints,), objects out of the way; return whether it collides."""
         data = self.data
         self._moving = {}
         mujoco.mj_resetData(self.model, data)
@@ -135,17 +149,17 @@ class URSimulation:
         return self.in_collision
 
     def place_object(self, index: int, position: ArrayLike) -> None:
-        """Put an object at `position` [m] (3,) in base_link and leave it there."""
+        """Put an object at `position` [m] (3,) in the base's frame and leave it there."""
         self.move_objects({index: np.asarray(position, dtype=np.float64)[None, :]})
 
     def move_objects(self, paths: dict[int, Path]) -> None:
-        """Let objects move along `paths` ((n, 3) [m] in base_link, 100 positions a second, repeated) from now.
+        """Let objects move along `paths` ((n, 3) [m] in the base's frame, 100 positions a second, repeated) from now.
 
         Call it after `place`, which ends all paths.
         """
         self._tick = 0
         for index, path in paths.items():
-            in_world = path + (0.0, 0.0, BASE_HEIGHT)
+            in_world = path + (0.0, 0.0, self.BASE_HEIGHT)
             mocap = self._objects[index]
             self.data.mocap_pos[mocap] = in_world[0]
             self._moving.pop(mocap, None)
@@ -160,7 +174,7 @@ class URSimulation:
             self.advance()
 
     def set_payload(self, mass: float) -> None:
-        """Fasten a point mass [kg] to tool0, unknown to the arm's gravity compensation; 0 removes it."""
+        """Fasten a point mass [kg] to the tool, unknown to the arm's gravity compensation; 0 removes it."""
         if not 0.0 <= mass <= MAX_PAYLOAD:
             raise ValueError(f"the payload is {mass:g} kg: expected 0 to {MAX_PAYLOAD:g} kg")
         self.model.body_mass[self._payload] = mass
@@ -177,9 +191,9 @@ class URSimulation:
         if not 0.0 <= size <= MAX_MODEL_ERROR:
             raise ValueError(f"the model error is {size:g}: expected 0 to {MAX_MODEL_ERROR:g} of the model's values")
         model, sheet = self.model, self._data_sheet
-        masses, inertias = rng.uniform(1.0 - size, 1.0 + size, (2, len(LINKS)))
-        gains = rng.uniform(1.0 - size, 1.0 + size, 6)
-        friction = rng.uniform(0.0, size, 6) * self.parameters.effort_limits
+        masses, inertias = rng.uniform(1.0 - size, 1.0 + size, (2, len(self.LINKS)))
+        gains = rng.uniform(1.0 - size, 1.0 + size, len(self.JOINTS))
+        friction = rng.uniform(0.0, size, len(self.JOINTS)) * self._effort_limits
         speed = float(rng.uniform(1.0 - size, 1.0 + size))
         model.body_mass[self._links] = sheet.masses * masses
         model.body_gravcomp[self._links] = 1.0 / masses
@@ -201,7 +215,7 @@ class URSimulation:
     # -- moving
 
     def command(self, joint_positions: ArrayLike) -> None:
-        """Replace the trajectory: move to `joint_positions` [rad] (6,), all joints arriving together.
+        """Replace the trajectory: move to `joint_positions` [rad] (joints,), all joints arriving together.
 
         It takes max(0.5 s, the slowest joint's way at its scaled velocity limit) and starts at the current setpoint.
         """
@@ -220,7 +234,7 @@ class URSimulation:
         self._remaining = 0
 
     def drive(self, velocity: ArrayLike) -> None:
-        """Let one control cycle pass in which the setpoint moves at a velocity [rad/s] (6,)."""
+        """Let one control cycle pass in which the setpoint moves at a velocity [rad/s] (joints,)."""
         self._velocity[:] = velocity
         self._remaining = self._substeps
         self.advance()
@@ -261,8 +275,8 @@ class URSimulation:
 
     @property
     def commanded_velocity(self) -> Vector:
-        """Joint velocities [rad/s] (6,) of the trajectory that is being executed; zero once it has arrived."""
-        return self._velocity.copy() if self._remaining else np.zeros(6)
+        """Joint velocities [rad/s] (joints,) of the trajectory that is being executed; zero once it has arrived."""
+        return self._velocity.copy() if self._remaining else np.zeros(len(self.JOINTS))
 
     def arm_state(self) -> ArmState:
         """Return the arm of this moment; a simulation's clock is its own."""
@@ -273,68 +287,78 @@ class URSimulation:
 
     @property
     def joint_positions(self) -> Vector:
-        """Joint positions [rad] (6,), a view into the simulation."""
+        """Joint positions [rad] (joints,), a view into the simulation."""
         return self.data.qpos  # type: ignore[no-any-return]  # mujoco's views are untyped
 
     @property
     def joint_velocities(self) -> Vector:
-        """Joint velocities [rad/s] (6,), a view into the simulation."""
+        """Joint velocities [rad/s] (joints,), a view into the simulation."""
         return self.data.qvel  # type: ignore[no-any-return]
 
     @property
+    def joint_torques(self) -> Vector:
+        """Torques of the actuators [Nm] (joints,), gravity compensation included; a view into the simulation."""
+        return self.data.qfrc_actuator  # type: ignore[no-any-return]
+
+    @property
     def tool_position(self) -> Vector:
-        """tool0's position in base_link [m] (3,)."""
+        """The tool's position in the base's frame [m] (3,)."""
         position: Vector = self._tool_xpos.copy()
-        position[2] -= BASE_HEIGHT
+        position[2] -= self.BASE_HEIGHT
         return position
 
-    def joints_towards(self, position: ArrayLike) -> Vector:
-        """Return joint positions [rad] (6,) that bring tool0 to a position in base_link [m] (3,), or near it.
+    def joints_towards(
+        self, position: ArrayLike, rotation: Vector | None = None, *, start: ArrayLike | None = None
+    ) -> Vector:
+        """Return joint positions [rad] (joints,) that bring the tool to a position of the base's frame [m] (3,).
 
-        Damped least squares from the arm's present posture, so that it is kept; nothing moves.
+        Or near it; with `rotation` (3, 3) the tool's axes too. Damped least squares from `start`, by default from the
+        arm's present posture, so that it is kept; nothing moves.
         """
         goal = np.asarray(position, dtype=np.float64)
-        joints: Vector = self.joint_positions.copy()
+        joints: Vector = np.array(self.joint_positions if start is None else start, dtype=np.float64)
         for _ in range(REACH_STEPS):
-            tool, jacobian = self.tool_at(joints)
+            tool, axes, jacobian = self._tool_at(joints)
             way = goal - tool
             way *= min(1.0, REACH_STEP / max(float(np.linalg.norm(way)), 1e-9))
-            damped = jacobian @ jacobian.T + REACH_DAMPING**2 * np.eye(3)
+            if rotation is None:
+                jacobian = jacobian[:3]
+            else:  # the axes' errors, as a rotation vector
+                turn = 0.5 * np.cross(axes.T, rotation.T).sum(axis=0)
+                turn *= min(1.0, REACH_TURN / max(float(np.linalg.norm(turn)), 1e-9))
+                way = np.concatenate([way, turn])
+            if float(np.linalg.norm(way)) < REACHED:
+                break
+            damping = REACH_DAMPING * min(1.0, float(np.linalg.norm(way)) / REACH_STEP)
+            damped = jacobian @ jacobian.T + max(damping, 1e-3) ** 2 * np.eye(len(way))
             joints += jacobian.T @ np.linalg.solve(damped, way)
         return joints
 
     def tool_at(self, joint_positions: ArrayLike) -> tuple[Vector, Vector]:
-        """Return tool0's position at given joints in base_link [m] (3,) and its Jacobian [m/rad] (3, 6)."""
+        """Return the tool's position at given joints in the base's frame [m] (3,) and its Jacobian [m/rad]."""
+        position, _, jacobian = self._tool_at(joint_positions)
+        return position, jacobian[:3]
+
+    def _tool_at(self, joint_positions: ArrayLike) -> tuple[Vector, Vector, Vector]:
         if self._trial is None:
             self._trial = mujoco.MjData(self.model)
-        trial, jacobian = self._trial, np.zeros((3, self.model.nv))
+        trial, jacobian = self._trial, np.zeros((6, self.model.nv))
         trial.qpos[:] = joint_positions
         mujoco.mj_kinematics(self.model, trial)
         mujoco.mj_comPos(self.model, trial)
-        mujoco.mj_jacSite(self.model, trial, jacobian, None, self._tool)
-        return trial.site_xpos[self._tool] - (0.0, 0.0, BASE_HEIGHT), jacobian
+        mujoco.mj_jacSite(self.model, trial, jacobian[:3], jacobian[3:], self._tool)
+        axes = trial.site_xmat[self._tool].reshape(3, 3)
+        return trial.site_xpos[self._tool] - (0.0, 0.0, self.BASE_HEIGHT), axes, jacobian
 
     @property
     def tool_rotation(self) -> Vector:
-        """The rotation matrix (3, 3) whose columns are tool0's axes in base_link."""
+        """The rotation matrix (3, 3) whose columns are the tool's axes in the base's frame."""
         return self._tool_xmat.reshape(3, 3)  # type: ignore[no-any-return]
 
-    @property
-    def forearm_position(self) -> Vector:
-        """The forearm link's origin, the elbow, in base_link [m] (3,)."""
-        position: Vector = self._forearm_xpos.copy()
-        position[2] -= BASE_HEIGHT
-        return position
-
-    @property
-    def forearm_rotation(self) -> Vector:
-        """The rotation matrix (3, 3) whose columns are the forearm link's axes in base_link."""
-        return self._forearm_xmat.reshape(3, 3)  # type: ignore[no-any-return]
-
     def object_position(self, index: int) -> Vector:
-        """Position of an object in base_link [m] (3,)."""
+        """Position of an object in the base's frame [m] (3,)."""
         position: Vector = self.data.mocap_pos[self._objects[index]].copy()
-        position[2] -= BASE_HEIGHT
+        position[2] -= self.BASE_HEIGHT
         return position
 
     @property
@@ -350,3 +374,50 @@ class URSimulation:
             bodies = [model.body(model.geom_bodyid[geom]).name for geom in contact.geom]
             pairs.append((bodies[0], bodies[1]))
         return pairs
+
+
+class URSimulation(ArmSimulation):
+    """A UR arm on its table.
+
+    `objects` are names of `OBJECT_MODELS`. Without `table` the arm stands 0.1 m above bare ground. `tool` is the end
+    effector: tool0, or tool1, whose x axis is tool0's z.
+    """
+
+    JOINTS = JOINTS
+    LINKS = LINKS
+    BASE_HEIGHT = BASE_HEIGHT
+
+    def __init__(
+        self,
+        ur_model: str = "ur5",
+        *,
+        max_velocity_scale: float = 0.1,
+        cycle_s: float = 0.1,
+        objects: Sequence[str] = ("sphere50_no_collision",),
+        table: Table = True,
+        tool: str = "tool0",
+    ) -> None:
+        self.parameters = ur_parameters(ur_model)
+        super().__init__(
+            self.parameters,
+            build_model(self.parameters, objects=objects, table=table),
+            tool=tool,
+            max_velocity_scale=max_velocity_scale,
+            cycle_s=cycle_s,
+            object_count=len(objects),
+        )
+        forearm = self.model.body("forearm").id
+        self._forearm_xpos = self.data.xpos[forearm]
+        self._forearm_xmat = self.data.xmat[forearm]
+
+    @property
+    def forearm_position(self) -> Vector:
+        """The forearm link's origin, the elbow, in base_link [m] (3,)."""
+        position: Vector = self._forearm_xpos.copy()
+        position[2] -= self.BASE_HEIGHT
+        return position
+
+    @property
+    def forearm_rotation(self) -> Vector:
+        """The rotation matrix (3, 3) whose columns are the forearm link's axes in base_link."""
+        return self._forearm_xmat.reshape(3, 3)  # type: ignore[no-any-return]

@@ -292,7 +292,7 @@ def test_robo_gyms_constructor_arguments_are_accepted_and_others_refused() -> No
     assert env.action_space.shape == (5,)
     with pytest.raises(TypeError, match="unexpected keyword argument 'ur_modell'"):
         make(ur_modell="ur5")
-    with pytest.raises(ValueError, match="all six joints are fixed"):
+    with pytest.raises(ValueError, match="all 6 joints are fixed"):
         make(fix_base=True, fix_shoulder=True, fix_elbow=True, fix_wrist_1=True, fix_wrist_2=True)
 
 
