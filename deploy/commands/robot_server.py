@@ -79,6 +79,7 @@ def robot_server_ur(
     reference_frame: Annotated[str, typer.Option(help="base_link (simulation) or base (the real controller's).")] = (
         "base_link"
     ),
+    ee_frame: Annotated[str, typer.Option(help="End effector: tool0, or Isaac Lab's tool1.")] = "tool0",
     host: Host = "127.0.0.1",
     port: RobotPort = 50051,
     clock: Clock = "fast",
@@ -103,6 +104,7 @@ def robot_server_ur(
             rs_mode=rs_mode,
             action_mode=action_mode,
             reference_frame=reference_frame,
+            ee_frame=ee_frame,
             action_cycle_rate=action_cycle_rate,
             max_velocity_scale_factor=max_velocity_scale_factor,
             world=world,
@@ -113,6 +115,46 @@ def robot_server_ur(
             limits=parse_env_arguments(limit or []),
         )
         _serve(settings, f"{ur_model}, {rs_mode}, {action_mode}, {action_cycle_rate:g} Hz")
+
+
+@robot_server.command("panda")
+def robot_server_panda(
+    rs_mode: Annotated[str, typer.Option(help="Content of a state: only_robot or 1object.")] = "only_robot",
+    action_mode: Annotated[
+        str, typer.Option(help="abs_pos or delta_pos: joint positions; abs_vel or delta_vel: velocities.")
+    ] = "abs_pos",
+    action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 30.0,
+    max_velocity_scale_factor: Annotated[
+        float, typer.Option(help="Share of the joints' velocity limits that is used.")
+    ] = 0.2,
+    world: Annotated[str, typer.Option(help="empty, or a tabletop world of robo-gym.")] = "tabletop",
+    host: Host = "127.0.0.1",
+    port: RobotPort = 50051,
+    clock: Clock = "fast",
+    gui: Gui = False,
+    seed: Seed = None,
+) -> None:
+    """Serve a Panda until Ctrl-C.
+
+    Example: `rlservo robot-server panda --rs-mode 1object --port 50051`, then
+    `gym.make("EndEffectorPositioningPandaRob-v0", rs_address="127.0.0.1:50051")` in robo-gym 2.1
+    """
+    with _one_sentence_errors():
+        from rlservo.envs.robot_server.settings import PandaSettings
+
+        settings = PandaSettings(
+            host=host,
+            port=port,
+            clock=clock,
+            gui=gui,
+            seed=seed,
+            rs_mode=rs_mode,
+            action_mode=action_mode,
+            action_cycle_rate=action_cycle_rate,
+            max_velocity_scale_factor=max_velocity_scale_factor,
+            world=world,
+        )
+        _serve(settings, f"panda, {rs_mode}, {action_mode}, {action_cycle_rate:g} Hz")
 
 
 @robot_server.command("mir100")

@@ -1,8 +1,9 @@
 """Parser of the roslaunch lines that robo-gym's environments send to a server manager.
 
-Arguments and their defaults: jr-robotics/robo-gym-robot-servers, ur_robot_server/launch/ur_robot_server.launch and
-mir100_robot_server/launch/sim_robot_server.launch. Unknown arguments are refused by name; one that only concerns the
-windows of Gazebo and RViz is accepted and has no effect; one that asks for something that is not simulated is refused.
+Arguments and their defaults: jr-robotics/robo-gym-robot-servers, ur_robot_server/launch/ur_robot_server.launch,
+panda_robot_server/launch/panda_robot_server.launch and mir100_robot_server/launch/sim_robot_server.launch. Unknown
+arguments are refused by name; one that only concerns the windows of Gazebo and RViz is accepted and has no effect; one
+that asks for something that is not simulated is refused.
 """
 
 from __future__ import annotations
@@ -10,25 +11,31 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Callable, Mapping
+from typing import Any
 
-from rlservo.envs.robot_server.settings import MAX_OBJECTS, Mir100Settings, Settings, URSettings
+from rlservo.envs.robot_server.settings import MAX_OBJECTS, Mir100Settings, PandaSettings, Settings, URSettings
 
 # Accepted, without effect.
 WINDOWS = {"gui", "rviz_gui", "gazebo_gui", "rviz_config_path", "rviz_config_file"}
 # Accepted with the values that mean what is simulated anyway.
-UR_ONLY = {
+ZERO = ("0.0", "0")
+ARM_ONLY = {
     "real_robot": ("false",),
-    "use_voxel_occupancy": ("false",),
     "object_trajectory_file_name": ("no_file", ""),
-    "camera1_gazebo": ("false",),
-    **dict.fromkeys(("x", "y", "roll", "pitch", "yaw"), ("0.0", "0")),
-    "z": ("0.1",),
+    **dict.fromkeys(("x", "y", "roll", "pitch", "yaw"), ZERO),
 }
-MIR100_ONLY: dict[str, tuple[str, ...]] = dict.fromkeys(("robot_x", "robot_y", "robot_yaw"), ("0.0", "0"))
-UR_KNOWN = {
-    "ur_model", "world_name", "max_velocity_scale_factor", "server_port", "action_cycle_rate", "reference_frame",
-    "target_mode", "rs_mode", "action_mode", "objects_controller", "n_objects",
+UR_ONLY = {**ARM_ONLY, "use_voxel_occupancy": ("false",), "camera1_gazebo": ("false",)}
+UR_HEIGHT = ("0.1",)  # z on robo-gym's own table and without one; on Isaac Lab's table it is 0
+PANDA_ONLY = {
+    **ARM_ONLY, "z": ZERO, "custom_joint_states_handler": ("false",),
+    **dict.fromkeys(("subsampling_factor", "new_vel_weight", "new_eff_weight"), ("1", "1.0")),
 }  # fmt: skip
+MIR100_ONLY: dict[str, tuple[str, ...]] = dict.fromkeys(("robot_x", "robot_y", "robot_yaw"), ZERO)
+ARM_KNOWN = {
+    "world_name", "max_velocity_scale_factor", "server_port", "action_cycle_rate", "reference_frame", "ee_frame",
+    "rs_mode", "action_mode", "objects_controller", "n_objects",
+}  # fmt: skip
+UR_KNOWN = ARM_KNOWN | {"ur_model", "target_mode"}
 MIR100_KNOWN = {"world_name", "server_port"}
 _OBJECT = re.compile(r"object_([0-9]{1,3})_(model_name|frame)")
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -67,8 +74,8 @@ def parse_launch_line(line: str, *, gui: bool = False, clock: str = "fast", host
 
 
 def _parse_ur(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> URSettings:
-    objects = {name for name in arguments if _OBJECT.fullmatch(name)}
-    _check_names(arguments, UR_KNOWN | objects, UR_ONLY)
+    world = arguments.get("world_name", "empty.world")
+    _check_names(arguments, UR_KNOWN, {**UR_ONLY, "z": ZERO if world.startswith("isaac") else UR_HEIGHT})
     if "ur_model" not in arguments:
         raise ValueError("the argument ur_model is missing, and the launch file has no default for it")
     mode = arguments.get("rs_mode", "false")
@@ -76,18 +83,38 @@ def _parse_ur(arguments: Mapping[str, str], gui: bool, clock: str, host: str) ->
         mode = arguments.get("target_mode", "only_robot")
     return URSettings(
         host=host,
-        port=_port(arguments),
         clock=clock,
         gui=gui,
         ur_model=arguments["ur_model"],
         rs_mode=mode,
         action_mode=arguments.get("action_mode", "abs_pos"),
         reference_frame=arguments.get("reference_frame", "base"),
-        action_cycle_rate=_number(arguments, "action_cycle_rate", 25.0),
-        max_velocity_scale_factor=_number(arguments, "max_velocity_scale_factor", 1.0),
-        world=arguments.get("world_name", "empty.world"),
-        objects=_objects(arguments),
+        **_of_arm(arguments, world),
     )
+
+
+def _parse_panda(arguments: Mapping[str, str], gui: bool, clock: str, host: str) -> PandaSettings:
+    _check_names(arguments, ARM_KNOWN, PANDA_ONLY)
+    return PandaSettings(
+        host=host,
+        clock=clock,
+        gui=gui,
+        rs_mode=arguments.get("rs_mode", "only_robot"),
+        action_mode=arguments.get("action_mode", "delta_pos"),
+        reference_frame=arguments.get("reference_frame", "base"),
+        **_of_arm(arguments, arguments.get("world_name", "empty.world")),
+    )
+
+
+def _of_arm(arguments: Mapping[str, str], world: str) -> dict[str, Any]:
+    return {
+        "port": _port(arguments),
+        "ee_frame": arguments.get("ee_frame", ""),
+        "action_cycle_rate": _number(arguments, "action_cycle_rate", 25.0),
+        "max_velocity_scale_factor": _number(arguments, "max_velocity_scale_factor", 1.0),
+        "world": world,
+        "objects": _objects(arguments),
+    }
 
 
 def _objects(arguments: Mapping[str, str]) -> tuple[str, ...]:
@@ -118,23 +145,25 @@ def _parse_mir100(arguments: Mapping[str, str], gui: bool, clock: str, host: str
 
 LAUNCH_FILES: dict[str, tuple[str, Callable[[Mapping[str, str], bool, str, str], Settings]]] = {
     "ur_robot_server": ("ur_robot_server.launch", _parse_ur),
+    "panda_robot_server": ("panda_robot_server.launch", _parse_panda),
     "mir100_robot_server": ("sim_robot_server.launch", _parse_mir100),
 }
 
 
 def _check_names(arguments: Mapping[str, str], known: set[str], only: Mapping[str, tuple[str, ...]]) -> None:
+    has_objects = "n_objects" in known
     expected = known | WINDOWS | set(only)
-    unknown = [name for name in arguments if name not in expected]
+    unknown = [name for name in arguments if name not in expected and not (has_objects and _OBJECT.fullmatch(name))]
     if unknown:
         more = f" and {len(unknown) - 5} more" if unknown[5:] else ""
         raise ValueError(
             f"launch arguments that are not known: {', '.join(name[:50] for name in unknown[:5])}{more}; "
-            f"expected some of {', '.join(sorted(name for name in expected if not _OBJECT.fullmatch(name)))}, "
-            "object_<i>_model_name, object_<i>_frame"
+            f"expected some of {', '.join(sorted(expected))}"
+            + (", object_<i>_model_name, object_<i>_frame" if has_objects else "")
         )
     for name, values in only.items():
         if name in arguments and arguments[name].lower() not in values:
-            raise ValueError(f"{name}:={arguments[name]} is not simulated: expected {name}:={values[0]}, the default")
+            raise ValueError(f"{name}:={arguments[name]} is not simulated: expected {name}:={values[0]}")
 
 
 def _port(arguments: Mapping[str, str]) -> int:

@@ -17,7 +17,7 @@ from rlservo.envs.robot_server.robot import CLOCKS
 from rlservo.envs.robot_server.rpc_handler import rpc_handler
 from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, arrives, bind, stop_signals
 from rlservo.envs.robot_server.server_process import ServerProcess
-from rlservo.envs.robot_server.settings import Settings, URSettings
+from rlservo.envs.robot_server.settings import PandaSettings, Settings, URSettings
 
 MANAGER_PORTS = range(50100, 50200)  # robo-gym's clients look for a manager here, in this order
 MAX_SERVERS = 100
@@ -231,7 +231,9 @@ def _bind_first(server: grpc.Server, host: str, ports: range | tuple[int, ...]) 
 
 
 def _title(settings: Settings) -> str:
-    return f"robot server {settings.ur_model if isinstance(settings, URSettings) else 'mir100'}"
+    if isinstance(settings, URSettings):
+        return f"robot server {settings.ur_model}"
+    return f"robot server {'panda' if isinstance(settings, PandaSettings) else 'mir100'}"
 
 
 def _why(exit_code: int | None) -> str:

@@ -26,7 +26,7 @@ from rlservo.envs.robot_server.clock import Clock
 from rlservo.envs.robot_server.connections import count_connections
 from rlservo.envs.robot_server.robot import Robot
 from rlservo.envs.robot_server.service import RobotService
-from rlservo.envs.robot_server.settings import Settings, URSettings, settings_from_json
+from rlservo.envs.robot_server.settings import PandaSettings, Settings, URSettings, settings_from_json
 
 THREADS = 8  # calls at a time; one of them moves the robot
 OPTIONS = [("grpc.so_reuseport", 0)]  # gRPC's default lets two servers share a port, and clients meet either
@@ -69,6 +69,10 @@ def make_robot(settings: Settings) -> Robot:
         from rlservo.envs.robot_server.ur_robot import URRobot
 
         return URRobot(settings)
+    if isinstance(settings, PandaSettings):
+        from rlservo.envs.robot_server.panda_robot import PandaRobot
+
+        return PandaRobot(settings)
     from rlservo.envs.robot_server.mir100_robot import Mir100Robot
 
     return Mir100Robot(settings)

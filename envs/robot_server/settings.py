@@ -6,23 +6,23 @@ The names are those of robo-gym's launch files; see launch_line.py for the lines
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from rlservo.envs.mir100.worlds import WORLDS as MIR100_WORLDS
 from rlservo.envs.robot_server.robot import CLOCKS
 from rlservo.envs.robots.arm import MUJOCO, host_of
+from rlservo.envs.ur.model import Table
 from rlservo.envs.ur.objects import object_model
 from rlservo.envs.ur.parameters import cycle_of, ur_parameters
-from rlservo.envs.ur.rs_modes import rs_mode_of
+from rlservo.envs.ur.rs_modes import RS_MODES
 
 ACTION_MODES = ("abs_pos", "delta_pos")
-REFERENCE_FRAMES = ("base_link", "base")
 MAX_OBJECTS = 10
 
-# Whether the arm stands on robo-gym's table, by the name of the Gazebo world.
-UR_WORLDS = {
+# The table an arm stands on, by the name of the Gazebo world; no arm feels gravity, in a `_no_gravity` world or not.
+ARM_WORLDS: dict[str, Table] = {
     "empty": False,
     "2_box100": False,
     "tabletop": True,
@@ -30,6 +30,7 @@ UR_WORLDS = {
     "tabletop_sphere50": True,
     "tabletop_sphere50_no_collision": True,
     "tabletop_sphere50_green_sphere50_no_collision": True,
+    "isaactabletop_sphere50_no_collision": "isaac",
 }
 # The robot's world in Gazebo -> ours.
 MIR100_WORLD_NAMES = {"empty_world_target": "empty", **{name: name for name in MIR100_WORLDS}}
@@ -58,17 +59,65 @@ class Common:
 
 
 @dataclass(frozen=True)
-class URSettings(Common):
-    """A robot server for one of the seven arms."""
+class ArmSettings(Common):
+    """A robot server for an arm."""
 
-    ur_model: str = "ur5"
+    RS_MODES: ClassVar[Mapping[str, int]]  # how many objects a mode's state has
+    ACTION_MODES: ClassVar[tuple[str, ...]] = ACTION_MODES
+    FRAMES: ClassVar[tuple[str, ...]]  # poses can be in
+    EE_FRAMES: ClassVar[tuple[str, ...]]  # the end effector can be
+
     rs_mode: str = "only_robot"
     action_mode: str = "abs_pos"
-    reference_frame: str = "base_link"
+    reference_frame: str = ""  # "": the first of FRAMES
+    ee_frame: str = ""  # "": the first of EE_FRAMES
     action_cycle_rate: float = 25.0  # [Hz]
     max_velocity_scale_factor: float = 1.0
     world: str = "tabletop"
     objects: tuple[str, ...] | None = None  # None: as many as the mode needs
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _one_of("rs_mode", self.rs_mode, self.RS_MODES)
+        _one_of("action_mode", self.action_mode, self.ACTION_MODES)
+        _one_of("reference_frame", self.reference_frame or self.FRAMES[0], self.FRAMES)
+        _one_of("ee_frame", self.ee_frame or self.EE_FRAMES[0], self.EE_FRAMES)
+        _one_of("world", self.world, ARM_WORLDS, suffixes=(".world", "_no_gravity"))
+        cycle_of(self.action_cycle_rate)
+        if not 0.0 < self.max_velocity_scale_factor <= 1.0:
+            raise ValueError(
+                f"max_velocity_scale_factor is {self.max_velocity_scale_factor:g}: expected more than 0, at most 1"
+            )
+        objects = self.object_names
+        for name in objects:
+            object_model(name)
+        if not self.RS_MODES[self.rs_mode] <= len(objects) <= MAX_OBJECTS:
+            raise ValueError(
+                f"rs_mode {self.rs_mode!r} needs {self.RS_MODES[self.rs_mode]} to {MAX_OBJECTS} objects, and there are "
+                f"{len(objects)} (a launch line has them with objects_controller:=true n_objects:=... "
+                "object_0_model_name:=...)"
+            )
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """The objects in the scene."""
+        return OBJECTS_BY_MODE[self.rs_mode] if self.objects is None else tuple(self.objects)
+
+    @property
+    def table(self) -> Table:
+        """Which table the arm stands on, if any."""
+        return ARM_WORLDS[_plain(self.world)]
+
+
+@dataclass(frozen=True)
+class URSettings(ArmSettings):
+    """A robot server for one of the seven arms."""
+
+    RS_MODES: ClassVar[Mapping[str, int]] = {name: mode.objects for name, mode in RS_MODES.items()}
+    FRAMES = ("base_link", "base")
+    EE_FRAMES = ("tool0", "tool1")
+
+    ur_model: str = "ur5"
     robot: str = MUJOCO  # or rtde://HOST
     limits: dict[str, Any] = field(default_factory=dict)  # of a real arm, as envs/robots/limits.py has them
     confirm: bool = True  # ask at the terminal before a real arm moves to a pose of SetState
@@ -78,33 +127,16 @@ class URSettings(Common):
         super().__post_init__()
         ur_parameters(self.ur_model)
         host_of(self.robot)
-        mode = rs_mode_of(self.rs_mode)
-        _one_of("action_mode", self.action_mode, ACTION_MODES)
-        _one_of("reference_frame", self.reference_frame, REFERENCE_FRAMES)
-        _one_of("world", self.world, UR_WORLDS, suffix=".world")
-        cycle_of(self.action_cycle_rate)
-        if not 0.0 < self.max_velocity_scale_factor <= 1.0:
-            raise ValueError(
-                f"max_velocity_scale_factor is {self.max_velocity_scale_factor:g}: expected more than 0, at most 1"
-            )
-        objects = self.object_names
-        for name in objects:
-            object_model(name)
-        if not mode.objects <= len(objects) <= MAX_OBJECTS:
-            raise ValueError(
-                f"rs_mode {self.rs_mode!r} needs {mode.objects} to {MAX_OBJECTS} objects, and there are {len(objects)}"
-                " (a launch line has them with objects_controller:=true n_objects:=... object_0_model_name:=...)"
-            )
 
-    @property
-    def object_names(self) -> tuple[str, ...]:
-        """The objects in the scene."""
-        return OBJECTS_BY_MODE[self.rs_mode] if self.objects is None else tuple(self.objects)
 
-    @property
-    def table(self) -> bool:
-        """Whether the arm stands on the table."""
-        return UR_WORLDS[self.world.removesuffix(".world")]
+@dataclass(frozen=True)
+class PandaSettings(ArmSettings):
+    """A robot server for the Panda."""
+
+    RS_MODES: ClassVar[Mapping[str, int]] = {"only_robot": 0, "1object": 1}
+    ACTION_MODES = (*ACTION_MODES, "abs_vel", "delta_vel")
+    FRAMES = ("world", "base", "panda_link0")
+    EE_FRAMES = ("panda_hand",)
 
 
 @dataclass(frozen=True)
@@ -115,7 +147,7 @@ class Mir100Settings(Common):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _one_of("world", self.world, MIR100_WORLD_NAMES, suffix=".world")
+        _one_of("world", self.world, MIR100_WORLD_NAMES, suffixes=(".world",))
 
     @property
     def world_name(self) -> str:
@@ -123,13 +155,13 @@ class Mir100Settings(Common):
         return MIR100_WORLD_NAMES[self.world.removesuffix(".world")]
 
 
-Settings = URSettings | Mir100Settings
-_KINDS: dict[str, type[Settings]] = {"ur": URSettings, "mir100": Mir100Settings}
+Settings = URSettings | PandaSettings | Mir100Settings
+_KINDS: dict[str, type[Settings]] = {"ur": URSettings, "panda": PandaSettings, "mir100": Mir100Settings}
 
 
 def settings_to_json(settings: Settings) -> str:
     """Return the settings as one line that `settings_from_json` understands."""
-    kind = "ur" if isinstance(settings, URSettings) else "mir100"
+    kind = next(name for name, one in _KINDS.items() if type(settings) is one)
     return json.dumps({"kind": kind, **asdict(settings)})
 
 
@@ -142,6 +174,13 @@ def settings_from_json(line: str) -> Settings:
     return kind(**values)
 
 
-def _one_of(name: str, value: str, names: Collection[str], *, suffix: str = "") -> None:
-    if value.removesuffix(suffix) not in names:
+def _plain(world: str) -> str:
+    return world.removesuffix(".world").removesuffix("_no_gravity")
+
+
+def _one_of(name: str, value: str, names: Collection[str], *, suffixes: Sequence[str] = ()) -> None:
+    plain = value
+    for suffix in suffixes:
+        plain = plain.removesuffix(suffix)
+    if plain not in names:
         raise ValueError(f"{name} {value!r} does not exist: expected one of {', '.join(names)}")

@@ -9,6 +9,8 @@ import numpy as np
 
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.mir100.parameters import BEAM_COUNT
+from rlservo.envs.panda.arm_env import PandaArmEnv
+from rlservo.envs.panda.server_state import STATE_JOINTS
 from rlservo.envs.rendering import RenderedEnv
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, Empty, State
 from rlservo.envs.robot_server.mir100_robot import CUBES, ROBOT, STATE_LENGTH, TARGET
@@ -17,6 +19,7 @@ from rlservo.envs.ur.arm_env import BASE, LIMITS, URArmEnv
 from rlservo.envs.ur.parameters import JOINTS
 
 SCAN = slice(8, 8 + BEAM_COUNT)
+PANDA = [f"{joint}_position" for joint in STATE_JOINTS]
 OBJECT = [f"object_0_to_ref_translation_{axis}" for axis in "xyz"]
 
 
@@ -58,11 +61,14 @@ def env_of(state: RobotState) -> str:
     if f"{JOINTS[0]}_joint_position" in state.names:
         has_object = OBJECT[0] in state.names
         return f"rlservo/{'EndEffectorPositioning' if has_object else 'EmptyEnvironment'}URSim-v0"
+    if PANDA[0] in state.names:
+        has_object = OBJECT[0] in state.names
+        return f"rlservo/{'EndEffectorPositioning' if has_object else 'EmptyEnvironment'}PandaSim-v0"
     if len(state.values) == STATE_LENGTH:
         has_cubes = any(state.values[CUBES])
         return f"rlservo/{'ObstacleAvoidance' if has_cubes else 'NoObstacleNavigation'}Mir100Sim-v0"
     raise RobotServerError(
-        f"the state has {len(state.values)} numbers: expected a UR arm's by name, or a MiR100's 1030"
+        f"the state has {len(state.values)} numbers: expected a UR arm's or a Panda's by name, or a MiR100's 1030"
     )
 
 
@@ -73,6 +79,10 @@ def show_state(env: RenderedEnv, state: RobotState) -> None:
         env.simulation.place(np.clip(joints, -LIMITS, LIMITS))
         if env.target_position() is not None and OBJECT[0] in state.names:
             env.move_target(BASE + [state.names[name] for name in OBJECT])
+    elif isinstance(env, PandaArmEnv) and PANDA[0] in state.names:
+        env.simulation.place(np.clip([state.names[name] for name in PANDA], env.LOW, env.HIGH))
+        if env.target_position() is not None and OBJECT[0] in state.names:
+            env.move_target([state.names[name] for name in OBJECT])
     elif isinstance(env, Mir100Navigation) and len(state.values) == STATE_LENGTH:
         values = np.array(state.values)
         cubes = values[CUBES].reshape(-1, 3) if len(env.simulation.cubes) else None
@@ -97,8 +107,7 @@ def quantities(state: RobotState) -> dict[str, tuple[float, str]]:
 
 
 def _unit(name: str) -> str:
-    if name.endswith("joint_velocity"):
-        return "rad/s"
-    if name.endswith("joint_position"):
-        return "rad"
+    for suffix, unit in (("_velocity", "rad/s"), ("_position", "rad"), ("_effort", "Nm")):
+        if name.endswith(suffix):
+            return unit
     return "m" if "translation" in name else "1"

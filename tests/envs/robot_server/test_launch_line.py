@@ -10,6 +10,7 @@ import pytest
 from rlservo.envs.robot_server.launch_line import parse_launch_line
 from rlservo.envs.robot_server.settings import (
     Mir100Settings,
+    PandaSettings,
     Settings,
     URSettings,
     settings_from_json,
@@ -31,6 +32,19 @@ POSITIONING = f"""{UR} \
         object_0_model_name:=sphere50_no_collision \
         object_0_frame:=target ur_model:=ur10e gui:=false server_port:=50321"""
 
+# robo-gym 2.1's, its own line ends and all.
+ISAAC = f"""{UR}             rviz_gui:=True             gazebo_gui:=True \
+            world_name:=isaactabletop_sphere50_no_collision.world             reference_frame:=base_link \
+            ee_frame:=tool1             max_velocity_scale_factor:=0.2             action_cycle_rate:=30.0 \
+            objects_controller:=true             rs_mode:=1object             n_objects:=1.0 \
+            object_0_model_name:=sphere50_no_collision             object_0_frame:=target             z:=0.0 \
+            ur_model:=ur10"""
+PANDA = """roslaunch panda_robot_server panda_robot_server.launch         rviz_gui:=True         gazebo_gui:=True \
+        world_name:=tabletop_sphere50_no_collision_no_gravity.world         reference_frame:=world \
+        max_velocity_scale_factor:=0.2         action_cycle_rate:=30.0         objects_controller:=true \
+        rs_mode:=1object         action_mode:=abs_pos        n_objects:=1.0 \
+        object_0_model_name:=sphere50_no_collision         object_0_frame:=target """
+
 
 def test_positioning_line_of_robo_gym_is_understood() -> None:
     assert parse_launch_line(POSITIONING, gui=True, clock="real", host="0.0.0.0") == URSettings(
@@ -46,6 +60,19 @@ def test_positioning_line_of_robo_gym_is_understood() -> None:
         world="tabletop_sphere50_no_collision.world",
         objects=("sphere50_no_collision",),
     )
+
+
+def test_lines_of_robo_gym_2_1_are_understood() -> None:
+    reach, panda = parse_launch_line(ISAAC), parse_launch_line(PANDA)
+    assert isinstance(reach, URSettings) and isinstance(panda, PandaSettings)
+    assert (reach.ur_model, reach.ee_frame, reach.table, reach.action_cycle_rate) == ("ur10", "tool1", "isaac", 30.0)
+    assert (panda.reference_frame, panda.action_mode, panda.table) == ("world", "abs_pos", True)
+    for settings in (reach, panda):
+        assert settings.object_names == ("sphere50_no_collision",)
+        assert settings_from_json(settings_to_json(settings)) == settings
+    bare = parse_launch_line("roslaunch panda_robot_server panda_robot_server.launch")
+    assert isinstance(bare, PandaSettings)
+    assert (bare.action_mode, bare.table, bare.max_velocity_scale_factor) == ("delta_pos", False, 1.0)
 
 
 def test_what_is_left_out_has_the_launch_files_defaults() -> None:
@@ -80,7 +107,15 @@ def test_mir100_and_two_object_lines_are_understood() -> None:
         ("", "expected 'roslaunch <package> <launch file> name:=value"),
         ("rm -rf /", "the line is 'rm -rf /': expected 'roslaunch"),
         ("roslaunch 'ur_robot_server", "cannot be split into words: No closing quotation"),
-        ("roslaunch panda_robot_server x.launch", "package 'panda_robot_server' is not known: expected one of ur_rob"),
+        ("roslaunch sawyer_robot_server x.launch", "package 'sawyer_robot_server' is not known: expected one of ur_r"),
+        (
+            PANDA.replace("abs_pos", "abs"),
+            "action_mode 'abs' does not exist: expected one of abs_pos, delta_pos, abs_v",
+        ),
+        (f"{PANDA} ee_frame:=tool1", "ee_frame 'tool1' does not exist: expected one of panda_hand"),
+        (f"{PANDA} subsampling_factor:=2", "subsampling_factor:=2 is not simulated: expected subsampling_factor:=1"),
+        (ISAAC.replace("z:=0.0", "z:=0.1"), "z:=0.1 is not simulated: expected z:=0.0"),
+        (f"{UR} ur_model:=ur5 ee_frame:=tool2", "ee_frame 'tool2' does not exist: expected one of tool0, tool1"),
         ("roslaunch ur_robot_server ur99.launch", "launch file 'ur99.launch' of ur_robot_server is not known"),
         (UR, "the argument ur_model is missing"),
         (f"{UR} ur_model:=ur7", "ur_model 'ur7' does not exist: expected one of ur3, ur3e"),
