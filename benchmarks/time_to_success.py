@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import importlib.util
 import itertools
 import json
@@ -79,52 +80,23 @@ def sampling_processes(envs: int) -> int:
 
 def stable_baselines(settings: dict[str, Any], seed: int, *, processes: bool) -> Points:
     """Train with Stable-Baselines3's PPO."""
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+    from training_inference_ur_sb3 import make_env, make_ppo, rate_after
 
-    training, model, count = settings["training"], settings["model"], settings["envs"]
-
-    def make() -> gymnasium.Env[Any, Any]:
-        import rlservo.envs  # noqa: F401  # in a new process
-
-        made: gymnasium.Env[Any, Any] = Monitor(
-            gymnasium.make(settings["env"], disable_env_checker=True, **settings["env_config"])
-        )
-        return made
-
-    environments: list[Callable[[], gymnasium.Env[Any, Any]]] = [make] * count
-    vector = SubprocVecEnv(environments) if processes else DummyVecEnv(environments)
-    normalised = VecNormalize(vector, norm_reward=False)
-    steps_at, rates = (
-        zip(*training["lr"], strict=True) if isinstance(training["lr"], list) else ((0,), (training["lr"],))
+    batch = settings["training"]["train_batch_size_per_learner"]
+    environments: list[Callable[[], gymnasium.Env[Any, Any]]] = [functools.partial(make_env, settings)] * settings[
+        "envs"
+    ]
+    normalised = VecNormalize(
+        SubprocVecEnv(environments) if processes else DummyVecEnv(environments), norm_reward=False
     )
     done = 0
     torch.set_num_threads(os.cpu_count() or 1)
-    algorithm = PPO(
-        "MlpPolicy",
-        normalised,
-        learning_rate=lambda _: float(np.interp(done, steps_at, rates)),
-        n_steps=training["train_batch_size_per_learner"] // count,
-        batch_size=training["minibatch_size"],
-        n_epochs=training["num_epochs"],
-        gamma=training["gamma"],
-        gae_lambda=training["lambda_"],
-        clip_range=training["clip_param"],
-        vf_coef=training.get("vf_loss_coeff", 1.0),
-        max_grad_norm=training["grad_clip"],
-        policy_kwargs={
-            "net_arch": {"pi": model["fcnet_hiddens"], "vf": model["fcnet_hiddens"]},
-            "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[model["fcnet_activation"]],
-        },
-        seed=seed,
-        device="cpu",
-        stats_window_size=WINDOW,
-    )
+    algorithm = make_ppo(settings, normalised, seed, lambda _: rate_after(settings, done))
     began = time.monotonic()
     try:
         while True:
-            algorithm.learn(training["train_batch_size_per_learner"], reset_num_timesteps=False)
+            algorithm.learn(batch, reset_num_timesteps=False)
             done = algorithm.num_timesteps
             successes = algorithm.ep_success_buffer or ()
             success = float(np.mean(successes)) if len(successes) == WINDOW else 0.0
@@ -146,7 +118,9 @@ def comparable() -> list[str]:
     return [
         name
         for name, settings in every.items()
-        if settings["algorithm"] == "PPO" and "begin" not in settings and not settings["model"].get("use_lstm")
+        if settings["algorithm"] == "PPO"
+        and not settings.keys() & {"begin", "imitate"}
+        and not settings["model"].get("use_lstm")
     ]
 
 
