@@ -1,4 +1,4 @@
-"""Source of LEAPP bundles: a YAML of stages, their inputs and outputs, and a TorchScript model for each stage.
+"""Source of LEAPP bundles: a YAML of stages, their inputs and outputs, and a model for each: TorchScript or ONNX.
 
 Stages are chained by the YAML's data flow; tensors that flow back are the policy's state, whose first values are in a
 safetensors file. Kinds and element names become the contract's names and units.
@@ -64,7 +64,7 @@ class Leapp(Source):
         return one_policy(found[0], files, module_id, agent_id)
 
     def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002
-        return ""  # YAML, TorchScript and safetensors hold no pickled objects
+        return ""  # YAML, TorchScript, ONNX and safetensors hold no pickled objects
 
     def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:  # noqa: ARG002
         return _restore(files.root)
@@ -88,10 +88,10 @@ def _read(file: Path) -> dict[str, Any]:
 
 def _parameters(file: Path, name: str, model: Mapping[str, Any]) -> Mapping[str, Any]:
     parameters = model.get("parameters") or {}
-    if parameters.get("backend") != "jit":
+    if parameters.get("backend") not in ("jit", "onnx"):
         raise UnsupportedError(
-            f"{file}: stage '{name}' uses the backend {parameters.get('backend')!r}: only TorchScript can be traced; "
-            "export it with export_with='jit-trace'"
+            f"{file}: stage '{name}' uses the backend {parameters.get('backend')!r}: only TorchScript and ONNX can be "
+            "traced; export it with export_with='jit-trace'"
         )
     return dict(parameters)
 
@@ -133,13 +133,14 @@ def _restore(file: Path) -> RestoredPolicy:
     models, pipeline = described["models"], described["pipeline"]
     inputs = {t.key: t for name, model in models.items() for t in _tensors(file, name, model["inputs"])}
     outputs = {t.key: t for name, model in models.items() for t in _tensors(file, name, model["outputs"])}
-    paths = [str(file.with_name(model["parameters"]["model_path"])) for model in models.values()]
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", r"`torch\.jit\.\w+` is deprecated", DeprecationWarning)
             manager = InferenceManager(str(file))  # it checks the hashes and the connections
-            stages = torch.nn.ModuleList([torch.jit.load(path) for path in paths])  # type: ignore[no-untyped-call]
+            stages = torch.nn.ModuleList([_stage(file, model) for model in models.values()])
         initial = load_file(file.with_name(pipeline["initial_values"])) if pipeline.get("initial_values") else {}
+    except UnsupportedError:
+        raise
     except Exception as error:  # LEAPP, torch and safetensors raise several unrelated types
         raise CheckpointError(f"{file} cannot be loaded by LEAPP: {explain(error)}") from error
     seen = _named({key: inputs[key] for key in manager.inputs})
@@ -183,6 +184,19 @@ def _restore(file: Path) -> RestoredPolicy:
     rate = (pipeline.get("configs") or {}).get("frequency")
     names = ElementNames(_elements(seen, "obs"), _elements(given, "action"), float(rate) if rate else None)
     return restored(TorchPolicy(recipe, stages, act, lambda: replay), names, str(file), "leapp.InferenceManager")
+
+
+def _stage(file: Path, model: Mapping[str, Any]) -> Any:
+    """Return a stage as a torch module."""
+    import torch
+
+    parameters = model["parameters"]
+    path = file.with_name(parameters["model_path"])
+    if parameters["backend"] == "jit":
+        return torch.jit.load(str(path))  # type: ignore[no-untyped-call]
+    from rlservo.export.sources.onnx_stage import OnnxStage
+
+    return OnnxStage(path, *([each["name"] for each in model[side]] for side in ("inputs", "outputs")))
 
 
 def _tensors(file: Path, stage: str, described: Any) -> list[_Tensor]:

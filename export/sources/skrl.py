@@ -101,6 +101,12 @@ def _restore(file: Path, agent_file: Path, notify: Notify) -> RestoredPolicy:
     from rlservo.export.sources.torch_policy import TorchPolicy, restored
 
     config = read_yaml(agent_file)
+    kind = str((config.get("agent") or {}).get("class"))
+    if kind.lower().endswith("_rnn"):
+        raise UnsupportedError(
+            f"{file} is of a recurrent agent ({kind}), and agent.yaml does not say its models: make the agent in "
+            "Python and export it with rlservo.export_policy, as examples/skrl_recurrent.py does"
+        )
     weights = _load(file)
     observation_space, state_space, action_space = _spaces(file, config, weights)
     agent, acting = (_agent(file, config, (observation_space, state_space, action_space)) for _ in range(2))

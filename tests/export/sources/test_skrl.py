@@ -11,6 +11,7 @@ import pytest
 import yaml
 from gymnasium import spaces
 
+import rlservo
 from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.serve_app.runtime.policy import Policy
@@ -103,6 +104,66 @@ def test_a_categorical_policy_takes_the_likeliest_choice(tmp_path: Path, notices
         np.testing.assert_array_equal([policy.act(one.numpy()) for one in obs], wanted)
 
 
+@pytest.mark.parametrize("cell", ["GRU", "LSTM"])
+def test_a_recurrent_agent_forgets_where_an_episode_starts(cell: str, tmp_path: Path, notices: list[str]) -> None:
+    from skrl.agents.torch.ppo import PPO_RNN
+    from skrl.memories.torch import RandomMemory
+    from skrl.models.torch import GaussianMixin, Model
+    from skrl.resources.preprocessors.torch import RunningStandardScaler
+    from skrl_recurrent import RecurrentPolicy
+
+    class Recurrent(GaussianMixin, Model):  # type: ignore[misc]  # as skrl's documentation has it
+        def __init__(self, *spaces: Any) -> None:
+            Model.__init__(self, observation_space=spaces[0], action_space=spaces[1], device="cpu")
+            GaussianMixin.__init__(self)
+            self.memory = getattr(torch.nn, cell)(SEEN, 6, num_layers=2, batch_first=True)
+            self.head = torch.nn.Linear(6, 2)
+            self.log_std = torch.nn.Parameter(torch.zeros(2))
+
+        def get_specification(self) -> dict[str, Any]:
+            return {"rnn": {"sequence_length": 4, "sizes": [(2, 1, 6)] * (2 if cell == "LSTM" else 1)}}
+
+        def compute(self, inputs: dict[str, Any], role: str) -> tuple[Any, dict[str, Any]]:
+            before = tuple(inputs["rnn"]) if cell == "LSTM" else inputs["rnn"][0]
+            seen, after = self.memory(inputs["observations"][:, None], before)
+            after = list(after) if cell == "LSTM" else [after]
+            return self.head(seen[:, 0]).tanh(), {"log_std": self.log_std, "rnn": after}
+
+    torch.manual_seed(0)
+    seen = spaces.Box(-np.inf, np.inf, (SEEN,), np.float32)
+    chosen = spaces.Box(-1, 1, (2,), np.float32)
+    models = {"policy": Recurrent(seen, chosen), "value": Recurrent(seen, chosen)}
+    settings = {"observation_preprocessor": RunningStandardScaler,
+                "observation_preprocessor_kwargs": {"size": seen, "device": "cpu"}}  # fmt: skip
+    agent = PPO_RNN(models=models, memory=RandomMemory(memory_size=8, device="cpu"), cfg=settings,
+                    observation_space=seen, action_space=chosen, device="cpu")  # fmt: skip
+    agent.init()
+    agent.checkpoint_modules["observation_preprocessor"](1 + 2 * torch.randn(200, SEEN), train=True)
+    agent.enable_models_training_mode(False)
+    policy = RecurrentPolicy(agent)
+    result = rlservo.export_policy(
+        policy, seen, chosen, tmp_path, name="arm", state=policy.initial_state(), notify=notices.append
+    )
+    obs = observations()
+    wanted = []
+    for _ in range(2):  # skrl's own acting, its memory zero where an episode starts
+        memory = [torch.zeros(size) for size in policy.sizes]
+        for one in obs:
+            scaled = agent.checkpoint_modules["observation_preprocessor"](one[None])
+            outputs = agent.models["policy"].act(
+                {"observations": scaled, "states": None, "rnn": memory}, role="policy"
+            )[1]
+            memory = outputs["rnn"]
+            wanted.append(outputs["mean_actions"][0].detach().numpy())
+    with Policy.load(result.path) as acting:
+        found = []
+        for _ in range(2):
+            acting.reset()
+            found += [acting.act(one.numpy()) for one in obs]
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=2e-6)
+    assert not np.allclose(found[0], found[len(obs) // 2]), "the memory did not matter"
+
+
 def test_runs_that_cannot_be_read_are_refused_with_the_reason(tmp_path: Path, notices: list[str]) -> None:
     train(tmp_path / "run", config(), spaces.Box(-1, 1, (2,), np.float32))
     file = tmp_path / "run" / "params" / "agent.yaml"
@@ -120,5 +181,7 @@ def test_runs_that_cannot_be_read_are_refused_with_the_reason(tmp_path: Path, no
     other["models"]["policy"]["network"][0]["layers"] = [9]
     file.write_text(yaml.dump(other))
     refused("cannot be restored from agent.yaml: .*policy|size mismatch|Error")
+    file.write_text(yaml.dump(config("PPO_RNN")))
+    refused("is of a recurrent agent.*examples/skrl_recurrent.py", UnsupportedError)
     file.write_text("models: [")
     refused("agent.yaml cannot be read")
