@@ -58,15 +58,16 @@ def verify_bundle(
     episodes: int = 20,
     first_seed: int = 0,
     app_dir: str | Path = ".",
+    source: str | None = None,
     vecnormalize: str | Path | None = None,
     notify: Notify,
     progress: Notify = silent,
 ) -> VerifyResult:
     """Compare a bundle with a checkpoint and, given `env_id`, run both for `episodes` seeds from `first_seed`.
 
-    The environment is made with `env_config`, by default the one that the policy was trained with. The evaluation is
-    added to contract.json and SHA256SUMS is written again; the copy of the contract inside policy.onnx stays as
-    exported.
+    `source` and `vecnormalize` are those of the export. The environment is made with `env_config`, by default the one
+    that the policy was trained with. The evaluation is added to contract.json and SHA256SUMS is written again; the copy
+    of the contract inside policy.onnx stays as exported.
 
     Raises ParityError when they differ, BundleError, CheckpointError or UsageError.
     """
@@ -76,10 +77,10 @@ def verify_bundle(
     with fetch(checkpoint, progress) as local:
         origin = loaded.contract.provenance
         arguments = origin.env_config if env_config is None else env_config
-        source = find_source(Path(local), notify=notify)
-        require(source.extra, *source.packages, *TORCH)
-        files = source.locate(Path(local), origin.module_id, origin.agents[0] if origin.agents else None)
-        if warning := source.loads(files):
+        origin_of = find_source(Path(local), source, notify)
+        require(origin_of.extra, *origin_of.packages, *TORCH)
+        files = origin_of.locate(Path(local), origin.module_id, origin.agents[0] if origin.agents else None)
+        if warning := origin_of.loads(files):
             notify(f"loading {checkpoint if is_uri(checkpoint) else files.root}: {warning}")
         options = RestoreOptions(
             Path(app_dir),
@@ -88,7 +89,7 @@ def verify_bundle(
             _frames(loaded.contract),
         )
         seeds = range(first_seed, first_seed + episodes)
-        return _verify(loaded, source, files, options, env_id, arguments, seeds, notify, progress)
+        return _verify(loaded, origin_of, files, options, env_id, arguments, seeds, notify, progress)
 
 
 def _verify(

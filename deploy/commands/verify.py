@@ -37,7 +37,11 @@ def verify(
             "stuck (any or an element), payload [kg], model [share], base [m], target=outside, start=corner.",
         ),
     ] = None,
-    checkpoint: Annotated[str | None, typer.Option(help="RLlib checkpoint to compare with; a folder or a URI.")] = None,
+    checkpoint: Annotated[str | None, typer.Option(help="Checkpoint to compare with; a path or a URI.")] = None,
+    source: Annotated[str | None, typer.Option(help="Which trainer wrote --checkpoint; the path tells it.")] = None,
+    vecnormalize: Annotated[
+        Path | None, typer.Option(help="Of Stable-Baselines3, vecnormalize.pkl where it is not beside the checkpoint.")
+    ] = None,
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
     disturb: Annotated[
         bool, typer.Option("--disturb", help="Drive --env under disturbances: noise, latency, payload and others.")
@@ -76,6 +80,8 @@ def verify(
     """
     if not disturb and (disturbances or plot or write):
         raise UsageError("disturbances, --plot and --write need --disturb")
+    if checkpoint is None and (source is not None or vecnormalize is not None):
+        raise UsageError("--source and --vecnormalize need --checkpoint")
     if env_arg and not disturb and compiled is None:
         raise UsageError("--env-arg needs --disturb or --compiled")
     env = env and plain_id(env)
@@ -85,7 +91,8 @@ def verify(
     if compiled is not None:
         document |= _verify_compiled(compiled, bundle, env, episodes or 20, seed, env_arg or [], as_json)
     if checkpoint is not None:
-        document |= _verify_against(checkpoint, bundle, env, episodes or 20, seed, app_dir, as_json)
+        files = {"app_dir": app_dir, "source": source, "vecnormalize": vecnormalize}
+        document |= _verify_against(checkpoint, bundle, env, episodes or 20, seed, files, as_json)
     if disturb:
         table = _measure(
             bundle,
@@ -105,7 +112,7 @@ def verify(
 
 
 def _verify_against(
-    checkpoint: str, bundle: Path, env: str | None, episodes: int, seed: int, app_dir: Path, as_json: bool
+    checkpoint: str, bundle: Path, env: str | None, episodes: int, seed: int, files: dict[str, Any], as_json: bool
 ) -> dict[str, Any]:
     """Compare a bundle with its checkpoint; return the document for programs, and print it for people otherwise."""
     with needs_extra("train", "gymnasium"):
@@ -128,7 +135,7 @@ def _verify_against(
             env_config=env_config,
             episodes=episodes,
             first_seed=seed,
-            app_dir=app_dir,
+            **files,
             notify=note,
             progress=show,
         )

@@ -207,6 +207,7 @@ def test_rollout_replay_and_the_cockpit_drive_the_compiled_policy(compiled: Path
     ("words", "fragment"),
     [
         ((), "give --checkpoint to compare the bundle with, or --env with --disturb or --compiled"),
+        (("--disturb", "--source", "sb3"), "--source and --vecnormalize need --checkpoint"),
         (("--disturb",), "--disturb needs --env"),
         (("latency=2", "--env", "CartPole-v1"), "need --disturb"),
         (("--disturb", "wind=3", "--env", "CartPole-v1"), "'wind=3': expected KIND=SIZE"),

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlservo.export.contract.errors import CheckpointError, ParityError, UnsupportedError
+from rlservo.export.contract.errors import CheckpointError, ParityError, UnsupportedError, UsageError
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
 from rlservo.export.verify_bundle import verify_bundle
 from rlservo.serve_app.runtime.policy import Policy
@@ -206,6 +206,13 @@ def test_only_some_parts_are_normalized(tmp_path: Path, notices: list[str]) -> N
     seen = samples(parts, 8)
     wanted = [model.predict(vec.normalize_obs(obs), deterministic=True)[0] for episode in seen for obs in episode]
     same(episodes(result, seen), wanted)
+    again = {"source": "sb3", "notify": notices.append}
+    checked = verify_bundle(result.path, tmp_path / "model.zip", vecnormalize=tmp_path / "elsewhere.pkl", **again)
+    assert checked.parity.samples > 700
+    with pytest.raises(ParityError):
+        verify_bundle(result.path, tmp_path / "model.zip", **again)
+    with pytest.raises(UsageError, match="there is no source 'sb2': expected one of rllib"):
+        verify_bundle(result.path, tmp_path / "model.zip", source="sb2", notify=notices.append)
 
 
 @pytest.mark.parametrize("first", [True, False], ids=["normalized, then stacked", "stacked, then normalized"])
