@@ -45,6 +45,7 @@ from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import ENV_CREATOR, _global_registry, get_trainable_cls, register_env
+from shared.imitation import Imitation, fit_to_solution
 from shared.training_run import build, iterate, main_with_sentences, ray_session
 
 from rlservo import Policy, errors, export_checkpoint
@@ -81,7 +82,12 @@ class Row:
 def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     """Return the RLlib configuration that `training.yaml` describes. Raises UsageError."""
     config: AlgorithmConfig = get_trainable_cls(settings["algorithm"]).get_default_config()
-    config.environment(settings["env"], env_config=settings.get("env_config", {}), clip_rewards=False)
+    config.environment(
+        settings["env"],
+        env_config=settings.get("env_config", {}),
+        clip_rewards=False,
+        normalize_actions=settings.get("normalize_actions", True),
+    )
     chosen = _chosen_episodes(settings)
     # Under the environment's own name, which checkpoints keep: one that is restored elsewhere has no wrapper.
     if chosen["failed_share"] or chosen["out_of_reach_share"]:
@@ -421,6 +427,25 @@ def _forget(learner: Any, columns: list[int], count: int) -> None:
                 weight[:, columns] = 0.0
 
 
+def _imitate(algorithm: Algorithm, settings: dict[str, Any]) -> None:
+    """Fit the policy to its environment's solution, from the elements that decide it alone. Raises UsageError."""
+    learners, runners = algorithm.learner_group, algorithm.env_runner_group
+    assert learners is not None and runners is not None
+    began, imitation = time.monotonic(), Imitation(**settings["imitate"])
+    seen, count = _columns(settings, tuple(imitation.of))
+    unseen = [column for column in range(count) if column not in seen]
+
+    def fit(learner: Any, *_: Any) -> None:
+        _forget(learner, unseen, count)
+        error = fit_to_solution(learner.module["default_policy"], imitation, settings, seen)
+        print(
+            f"the solution imitated to {error:.4f} (root mean square) in {time.monotonic() - began:.0f} s", flush=True
+        )
+
+    learners.foreach_learner(fit)
+    runners.sync_weights(from_worker_or_learner_group=learners, inference_only=True)
+
+
 def train(
     config: AlgorithmConfig, settings: dict[str, Any], folder: Path, beginning: Beginning | None = None
 ) -> list[Row]:
@@ -433,6 +458,8 @@ def train(
     algorithm = build(config)
     if beginning is not None:
         beginning.apply(algorithm, settings)
+    if "imitate" in settings:
+        _imitate(algorithm, settings)
     try:
         with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -535,7 +562,7 @@ def main() -> None:
         parser.error(str(error))
     begin = settings.get("begin")  # {with: the name of a policy that ships, forget: [observed elements]}
     beginning = None if begin is None else Beginning(SHIPPED / begin["with"], tuple(begin.get("forget", ())))
-    seed = settings["seed"] if args.seed is None else args.seed
+    seed = settings["seed"] = settings["seed"] if args.seed is None else args.seed
     folder = args.storage / args.name
     folder.mkdir(parents=True, exist_ok=True)
 
