@@ -177,7 +177,7 @@ class Cell:
     def close(self) -> None:
         for process in self.processes.values():
             with contextlib.suppress(ProcessLookupError):
-                process.send_signal(signal.SIGINT)
+                process.terminate()  # a shell lets its background jobs ignore Ctrl-C
         for process in self.processes.values():
             try:
                 process.wait(30)
