@@ -77,7 +77,7 @@ def learn(
     require("train", "torch", "onnx")
     with needs_extra("client"):
         from rlservo.serve_app.client.admin_client import AdminClient, find_key
-        from rlservo.serve_app.client.promotion_limits import Limits
+        from rlservo.serve_app.client.promotion_evidence import Limits
     with needs_extra("record"):
         from rlservo.serve_app.learning.following import FollowedRecordings, ServerRecordings
     from rlservo.serve_app.learning.run_folder import RunFolder

@@ -28,7 +28,7 @@ from rlservo.export.contract.errors import ConflictError, UsageError
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint, silent
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.promotion_limits import Limits
+from rlservo.serve_app.client.promotion_evidence import Limits
 from rlservo.serve_app.learning.admission import Admission
 from rlservo.serve_app.learning.following import FollowedRecordings, ServerRecordings
 from rlservo.serve_app.learning.online import OnlineLearning
