@@ -75,8 +75,7 @@ class OnlineLearning:
         state = self._run.state
         if self._run.is_new:
             self._release.check_unclaimed()
-            if not self._keep(self._release.publish(self._learner.save)):
-                raise UsageError("robots did not get the checkpoint itself, and there is nothing else to go on from")
+            self._keep(self._release.publish(self._learner.save))
             self._say(f"version {state.versions[-1].version} is the checkpoint itself")
         else:
             self._learner.restore(self._run.checkpoint(state.versions[-1].version))
@@ -119,15 +118,19 @@ class OnlineLearning:
         return True
 
     def _serve_newest(self) -> bool:
-        """Let robots have the newest version; go without it where the server or its canary refused it."""
+        """Let robots have the newest version; continue without it if the server or its canary refused it.
+
+        Raises UsageError if it is the first, the checkpoint itself.
+        """
         versions = self._run.state.versions
         newest = versions[-1].version
         reason = self._release.serve(newest, versions[-2].version if len(versions) > 1 else None)
         if reason is None:
             return True
-        if len(versions) > 1:
-            versions.pop()
-            self._refuse(f"robots do not get version {newest}: {reason}")
+        if len(versions) == 1:
+            raise UsageError(f"robots do not get version {newest}, the checkpoint itself: {reason}")
+        versions.pop()
+        self._refuse(f"robots do not get version {newest}: {reason}")
         self._release.unload(newest)
         return False
 

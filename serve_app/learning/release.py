@@ -121,7 +121,7 @@ class Release:
         there = None if self._target.canary else self._until_reached(lambda: self._aliases().get(alias))
         if there is not None:
             raise ConflictError(
-                f"alias '{alias}' of policy '{name}' already points to version {there}: is another learner moving it? "
+                f"alias '{alias}' of policy '{name}' already leads to version {there}: is another learner moving it? "
                 f"Give this one its own --alias, or remove a left-over one with 'rlservo policy alias {name} {alias}='"
             )
 
@@ -165,7 +165,7 @@ class Release:
             return
         if there not in (None, before):
             raise ConflictError(
-                f"alias '{alias}' of policy '{name}' points to version {there}, but this run had moved it to "
+                f"alias '{alias}' of policy '{name}' leads to version {there}, but this run had moved it to "
                 f"{before}: is another learner moving it? Give each its own --alias"
             )
         with self._connect() as client:

@@ -324,7 +324,7 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
     assert cell.aliases()["learning"] == "1"
     with (
         cell.run_folder("second") as run,
-        pytest.raises(ConflictError, match=r"already points to version 1: .*policy alias policy learning='"),
+        pytest.raises(ConflictError, match=r"already leads to version 1: .*policy alias policy learning='"),
     ):
         cell.learning(run).run(versions=1)
     assert not (cell.folder / "policies/policy/4").exists()
