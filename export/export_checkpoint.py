@@ -94,6 +94,7 @@ class ExportOptions:
     untrained_filter: bool
     notify: Notify
     progress: Notify
+    reward: str = ""
 
 
 def export_checkpoint(
@@ -111,6 +112,7 @@ def export_checkpoint(
     source: str | None = None,
     vecnormalize: str | Path | None = None,
     frame_stack: int = 1,
+    reward: str = "",
     notify: Notify = logger.warning,
     progress: Notify = silent,
 ) -> ExportResult:
@@ -122,8 +124,9 @@ def export_checkpoint(
     classes, if the checkpoint needs any. `value` False leaves the value head out, which other servers compute for each
     action, too: a third of a small policy's time. `untrained_filter` also exports an observation filter whose
     statistics are empty, or only evaluation's. `vecnormalize` and `frame_stack` are for Stable-Baselines3: its
-    observation statistics, if they are not beside the model, and the number of frames it stacked. `notify` gets one
-    sentence for each thing a person should know (by default they are logged), `progress` what is being done.
+    observation statistics, if they are not beside the model, and the number of frames it stacked. `reward` names the
+    contract's reward function, `module:function`. `notify` gets one sentence for each thing a person should know (by
+    default they are logged), `progress` what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give the trainer's own actions. Nothing is left behind then.
@@ -135,7 +138,7 @@ def export_checkpoint(
             Path(app_dir), value, None if vecnormalize is None else Path(vecnormalize), frame_stack=frame_stack
         )
         options = ExportOptions(
-            chosen, Path(out), name, version, description, restore, untrained_filter, notify, progress
+            chosen, Path(out), name, version, description, restore, untrained_filter, notify, progress, reward
         )
         return export_files([files], options, checkpoint)[0]
 
@@ -258,6 +261,7 @@ def _build(
             ),
             baked_in=baked_steps(recipe, restored.module_class, restored.network.module, sorted(unread)),
             control_rate_hz=elements.control_rate_hz,
+            reward=options.reward,
             provenance=_provenance(files, facts, restored, source),
             parity=parity,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,6 +12,7 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.terminal import Json, note, print_json
+from rlservo.export.contract.contract import REWARD_PATTERN
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra
 
@@ -53,6 +55,9 @@ def export(
     frame_stack: Annotated[
         int, typer.Option(min=1, help="Stable-Baselines3: number of frames that VecFrameStack stacked.")
     ] = 1,
+    reward: Annotated[
+        str, typer.Option(metavar="MODULE:FUNCTION", help="Reward function for `rlservo learn`, named in the contract.")
+    ] = "",
     metric: Annotated[
         str | None, typer.Option(help="Metric that picks the best checkpoint of a Tune trial or experiment.")
     ] = None,
@@ -68,6 +73,8 @@ def export(
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
     start = time.perf_counter()
+    if re.fullmatch(REWARD_PATTERN, reward) is None:
+        raise UsageError(f"--reward {reward[:80]!r}: expected MODULE:FUNCTION, such as my_rewards:reach")
     if all_modules and (module_id is not None or agent_id is not None):
         raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
     with terminal.status("importing") as show, ExitStack() as fetching:
@@ -116,6 +123,7 @@ def export(
                 source=source,
                 vecnormalize=vecnormalize,
                 frame_stack=frame_stack,
+                reward=reward,
                 notify=note,
                 progress=show,
             )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import re
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -10,18 +12,22 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.policy import LOCAL, KeyFile
+from rlservo.deploy.commands.promote import LONGEST_S, PERCENT, SECONDS, parse_number
 from rlservo.export.contract.errors import UnavailableError, UsageError
 from rlservo.export.contract.extras import needs_extra, require
 
 
 def learn(
-    checkpoint: Annotated[Path, typer.Argument(help="A whole checkpoint of RLlib's PPO (new API stack), not pruned.")],
+    checkpoint: Annotated[Path, typer.Argument(help="A whole checkpoint of RLlib's PPO, APPO or SAC, not pruned.")],
     policy: Annotated[str, typer.Option(help="The served policy that learns.")],
     repository: Annotated[
         str, typer.Option(metavar="DIR|URI", help="The server's repository; versions are published there.")
     ],
-    recordings: Annotated[list[Path], typer.Option(help="Folder in which a server records; one for each server.")],
     out: Annotated[Path, typer.Option(help="The run's folder; the same command resumes from it.")],
+    recordings: Annotated[list[Path], typer.Option(help="Folder in which a server records; one for each server.")] = [],  # noqa: B006 - typer copies it
+    follow: Annotated[
+        list[str], typer.Option(metavar="URL", help="Remote server that records; its files are copied to OUT.")
+    ] = [],  # noqa: B006
     server: Annotated[str, typer.Option(help="URL of the server.", envvar="RLSERVO_URL")] = LOCAL,
     alias: Annotated[str, typer.Option(help="Alias of the newest version.")] = "learning",
     every: Annotated[int, typer.Option(min=1, help="Updates between two versions.")] = 5,
@@ -29,45 +35,63 @@ def learn(
         int | None, typer.Option(min=1, help="Steps of whole episodes per update; the checkpoint's by default.")
     ] = None,
     max_age: Annotated[
-        int, typer.Option(min=0, help="Versions by which the one that acted may be behind; older episodes are dropped.")
-    ] = 1,
+        int | None,
+        typer.Option(min=0, help="Versions by which the one that acted may be behind; PPO 1, APPO 3, SAC 10."),
+    ] = None,
     reward: Annotated[
         Path | None,
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="Python file with reward(obs, action, next_obs), instead of the clients' rewards.",
+            help="Python file with reward(obs, action, next_obs), instead of the contract's or the clients' rewards.",
         ),
     ] = None,
     versions: Annotated[
         int | None, typer.Option(min=1, help="Stop after this many new versions; at Ctrl-C by default.")
     ] = None,
+    promote: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Watch each version as a canary for this time (10m), then promote it."),
+    ] = None,
+    canary: Annotated[
+        str, typer.Option(metavar="SHARE", help="With --promote: share of the sessions that the canary gets.")
+    ] = "20%",
+    max_success_drop: Annotated[
+        str, typer.Option(metavar="SHARE", help="With --promote: allowed drop in successful episodes.")
+    ] = "5%",
+    max_error_rate: Annotated[
+        str, typer.Option(metavar="SHARE", help="With --promote: share of its requests that may fail.")
+    ] = "1%",
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     key_file: KeyFile = None,
 ) -> None:
     """Train a served policy from the robots that use it.
 
     Robots ask the server for `policy` under the alias and explore; the server records them. Their whole episodes train
-    PPO from the checkpoint on. Every few updates the result is exported, proven and published, the server loads it and
-    the alias moves to it: robots get it with their next episode. A version that the gate refuses reaches no robot.
+    the checkpoint's algorithm. Every few updates the result is exported, proven and published, the server loads it and
+    the alias moves to it: robots get it with their next episode. A version that the gate refuses reaches no robot. With
+    --promote, robots ask for `production`, and a version gets there by its canary.
 
     Example: `rlservo learn checkpoint --policy ur5 --repository policies --recordings recorded --out runs/ur5`
     """
     require("train", "torch", "onnx")
     with needs_extra("client"):
         from rlservo.serve_app.client.admin_client import AdminClient, find_key
+        from rlservo.serve_app.client.promotion_evidence import Limits
     with needs_extra("record"):
-        from rlservo.serve_app.learning.following import FollowedRecordings
+        from rlservo.serve_app.learning.following import FollowedRecordings, ServerRecordings
     from rlservo.serve_app.learning.run_folder import RunFolder
 
-    find_key(server, key_file)  # a missing key is found out before anything is loaded
-    followed = FollowedRecordings(recordings, terminal.note)
+    for url in {server, *follow}:
+        find_key(url, key_file)  # a missing key is found out before anything is loaded
+    if not recordings and not follow:
+        raise UsageError("nothing to learn from: give --recordings FOLDER, or --follow URL of a server that records")
     source = None if reward is None else reward.read_text()
     terms = {"checkpoint": str(checkpoint.absolute()), "policy": policy, "repository": repository}
 
-    def connect() -> AdminClient:
+    def connect(url: str) -> AdminClient:
         try:
-            return AdminClient(server, api_key=find_key(server, key_file))
+            return AdminClient(url, api_key=find_key(url, key_file))
         except UsageError as error:  # a server removes its own key when it ends, and writes one when it starts again
             raise UnavailableError(error.message) from None
 
@@ -79,20 +103,37 @@ def learn(
         from rlservo.export.checkpoints.unpickle import user_code
         from rlservo.serve_app.learning.admission import Admission, reward_of
         from rlservo.serve_app.learning.online import OnlineLearning, why_interrupted
-        from rlservo.serve_app.learning.release import Release, Target
+        from rlservo.serve_app.learning.release import Canary, Release, Target
         from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 
+        if promote is None:
+            watched = None
+        else:
+            rate = parse_number("--max-error-rate", max_error_rate, PERCENT, 1.0)
+            drop = parse_number("--max-success-drop", max_success_drop, PERCENT, 1.0)
+            share = parse_number("--canary", canary, {**PERCENT, "": 1.0}, 1.0)
+            seconds = parse_number("--promote", promote, SECONDS, LONGEST_S)
+            if not share or not seconds:
+                raise UsageError("--promote and --canary: expected more than 0")
+            watched = Canary(share, seconds, Limits(error_rate=rate, success_drop=drop))
+        copies = [
+            ServerRecordings(partial(connect, url), run.path / "followed" / re.sub(r"[^A-Za-z0-9.]+", "_", url))
+            for url in follow
+        ]
+        followed = FollowedRecordings(recordings, terminal.note, copies, show)
         logging.getLogger("ray").setLevel(logging.ERROR)  # of deprecated ways that RLlib itself takes
         try:
             with user_code(app_dir):
                 learner = OnlineLearner(checkpoint, batch_size=batch_size)
-                release = Release(Target(policy, repository, alias), run, connect, app_dir=app_dir, progress=show)
-                function = None if source is None else reward_of(source, str(reward))
-                admission = Admission(policy, max_age=max_age, reward=function)
-                OnlineLearning(
-                    learner, run, followed, admission, release,
-                    every=every, max_age=max_age, say=_say, progress=show,
-                ).run(versions)  # fmt: skip
+                target = Target(policy, repository, alias, watched)
+                release = Release(target, run, partial(connect, server), url=server, app_dir=app_dir, progress=show)
+                function = release.named_reward() if source is None else reward_of(source, str(reward))
+                age = learner.max_age if max_age is None else max_age
+                admission = Admission(policy, max_age=age, reward=function)
+                learning = OnlineLearning(
+                    learner, run, followed, admission, release, every=every, say=_say, progress=show
+                )
+                learning.run(versions)
         except KeyboardInterrupt:
             terminal.note(why_interrupted(run))
             raise typer.Exit(130) from None

@@ -83,10 +83,10 @@ def promote(
         if re.fullmatch(pattern, text) is None:  # both become part of a file's name
             raise UsageError(f"{text[:80]!r} is not a {what}")
     limits = Limits(
-        error_rate=_number("--max-error-rate", max_error_rate, PERCENT, 1.0),
-        p99_s=_number("--max-p99", max_p99, SECONDS, 1.0),
+        error_rate=parse_number("--max-error-rate", max_error_rate, PERCENT, 1.0),
+        p99_s=parse_number("--max-p99", max_p99, SECONDS, 1.0),
         action_difference=max_action_difference,
-        success_drop=_number("--max-success-drop", max_success_drop, PERCENT, 1.0),
+        success_drop=parse_number("--max-success-drop", max_success_drop, PERCENT, 1.0),
         min_requests=min_requests,
         min_episodes=min_episodes,
     )
@@ -94,8 +94,8 @@ def promote(
         raise UsageError(
             "no limit was given: give --max-error-rate, --max-p99, --max-action-difference or --max-success-drop"
         )
-    share = _number("--canary", canary, {**PERCENT, "": 1.0}, 1.0)
-    watched_s = _number("--for", seconds, SECONDS, LONGEST_S)
+    share = parse_number("--canary", canary, {**PERCENT, "": 1.0}, 1.0)
+    watched_s = parse_number("--for", seconds, SECONDS, LONGEST_S)
     if not share or not watched_s:
         raise UsageError("--canary and --for: expected more than 0")
     terms = Terms(tuple(url), name, version, share, watched_s, limits)
@@ -135,7 +135,8 @@ def _signals() -> Iterator[None]:
         yield
 
 
-def _number(option: str, text: str | None, units: dict[str, float], largest: float) -> float | None:
+def parse_number(option: str, text: str | None, units: dict[str, float], largest: float) -> float | None:
+    """Return the number that an option gives with its unit. Raises UsageError."""
     if text is None:
         return None
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)\s*([a-z%]*)", text.strip())

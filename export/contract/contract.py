@@ -15,6 +15,7 @@ from rlservo.export.contract.spaces import FrozenModel, Shape, Size, SpaceSpec
 VALUE = "value"  # the graph's output of the value head, if it was exported
 REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
+REWARD_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*)?$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
 Tolerance: TypeAlias = Annotated[float, Field(ge=0.0, le=1e-2)]
 """A larger difference is never rounding."""
@@ -151,6 +152,7 @@ class Contract(FrozenModel):
     distribution: Distribution | None
     baked_in: tuple[BakedStep, ...]
     control_rate_hz: float | None = Field(None, gt=0.0, description="Control rate of the environment [Hz]")
+    reward: str = Field("", pattern=REWARD_PATTERN, description="Reward function for learning online, module:function")
     provenance: Provenance
     parity: Parity
     evaluations: tuple[Evaluation, ...] = ()

@@ -37,9 +37,23 @@ class AdminClient(Closeable):
         listing: dict[str, Any] = self._transport.get("v1", "policies", timeout_s=LOOK_TIMEOUT_S)
         return listing
 
+    def contract(self, name: str) -> dict[str, Any]:
+        """Return the contract of a policy's default version."""
+        contract: dict[str, Any] = self._transport.get("v1", "policies", name, timeout_s=LOOK_TIMEOUT_S)
+        return contract
+
     def metrics(self) -> str:
         """Return the metrics in Prometheus' format."""
         return self._transport.get_text("metrics", timeout_s=LOOK_TIMEOUT_S)
+
+    def recordings(self) -> dict[str, int]:
+        """Return the server's recordings: the files' names, and how many bytes each has by now."""
+        files: dict[str, int] = self._transport.get("v1", "admin", "recordings", timeout_s=LOOK_TIMEOUT_S)
+        return files
+
+    def recording(self, name: str, begin: int) -> bytes:
+        """Return some MiB of a recording from byte `begin` on, as far as it goes; nothing at its end."""
+        return self._transport.get_bytes("v1", "admin", "recordings", name, str(begin))
 
     def plans(self) -> dict[str, int]:
         """Return the number of the plan that each process follows, by name: every worker, or one replica."""

@@ -109,8 +109,12 @@ class Transport:
 
     def get_text(self, *path: str, timeout_s: float | None = None) -> str:
         """Return the text at `/path[0]/path[1]/...`."""
+        return self.get_bytes(*path, timeout_s=timeout_s).decode("utf-8", "replace")
+
+    def get_bytes(self, *path: str, timeout_s: float | None = None) -> bytes:
+        """Return the content at `/path[0]/path[1]/...`."""
         content, *_ = self._call("GET", path, None, timeout_s, None)
-        return content.decode("utf-8", "replace")
+        return content
 
     def post(self, *path: str, body: bytes, timeout_s: float | None = None) -> Any:
         """Send a JSON document and return the JSON answer."""

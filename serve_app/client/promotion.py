@@ -71,7 +71,7 @@ class Promotion:
         log: PromotionLog,
         *,
         every_s: float,
-        say: Callable[[str], None],
+        say: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:

@@ -6,6 +6,7 @@ policy's: the server records what it drew, and the graph and contract it drew fr
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
@@ -23,8 +24,9 @@ from rlservo.serve_app.recording.own_actions import is_sent_as
 LOGP_TOLERANCE = 1e-4
 """Tolerance of a recorded log-probability against its own distribution's: both come from the same recorded float32."""
 
-Reward: TypeAlias = Callable[[Any, Any, Any], float]
-"""The reward of an action: `reward(obs, action, next_obs)`, each in its space's own form."""
+Reward: TypeAlias = Callable[[Any, Any, Any], "float | tuple[float, bool]"]
+"""The reward of an action: `reward(obs, action, next_obs)`, each in its space's own form; with it, if the function
+knows, whether the episode has ended there."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,29 @@ class Admission:
 
     def __init__(self, policy: str, *, max_age: int, reward: Reward | None = None) -> None:
         """`reward` replaces the rewards that clients report."""
-        self._policy, self._max_age, self._reward = policy, max_age, reward
+        self._policy, self.max_age, self._reward = policy, max_age, reward
 
-    def judge(self, episode: Episode, versions: Sequence[KnownVersion]) -> Admitted | str | None:
+    def parts(self, episode: Episode) -> list[Episode]:
+        """Split a recorded episode where the reward function ends one.
+
+        Without an end, the last decision is only the observation after the one before.
+        """
+        ours = episode.policy.contract.name == self._policy
+        if self._reward is None or not ours or episode.goes_on or _why_not_drawn(episode) is not None:
+            return [episode]
+        ends = [row + 1 for row, (_, ended) in enumerate(_computed(episode, self._reward)) if ended]
+        length = len(episode) if episode.ended else len(episode) - 1
+        if not ends and (episode.ended or length < 1):
+            return [episode]
+        begins = [0, *ends]
+        parts = [episode.part(begin, end, terminated=True) for begin, end in zip(begins, ends, strict=False)]
+        if begins[-1] < length:
+            parts.append(episode.part(begins[-1], length, terminated=episode.terminated))
+        return parts
+
+    def judge(
+        self, episode: Episode, versions: Sequence[KnownVersion], *, any_age: bool = False
+    ) -> Admitted | str | None:
         """Return the episode, or the reason against it; None if it is another policy's. `versions`: newest last."""
         contract = episode.policy.contract
         if contract.name != self._policy:
@@ -65,17 +87,23 @@ class Admission:
         known, age = versions[place], len(versions) - 1 - place
         if (episode.policy.graph_hash, episode.policy.contract_hash) != (known.graph_sha256, known.contract_sha256):
             return "of another graph or contract than the version's"
-        if age > self._max_age:
+        if age > self.max_age and not any_age:
             return "of a version that is too old"
         if (reason := why_not_whole(episode) or _why_not_drawn(episode)) is not None:
             return reason
-        rewards = episode.reward if self._reward is None else _rewards(episode, self._reward)
+        rewards = episode.reward
+        if self._reward is not None:
+            rewards = np.full(len(episode), np.nan)  # the last one's needs the observation after it
+            computed = [reward for reward, _ in _computed(episode, self._reward)]
+            rewards[: len(computed)] = computed
         reason = why_without_reward(episode, rewards)
         return Admitted(episode, known, age, rewards) if reason is None else reason
 
 
 def _why_not_drawn(episode: Episode) -> str | None:
     """Return the reason why an episode's actions are not the policy's own draws from its observations."""
+    if not episode.may_teach:
+        return "of which a key without the role explore reported something"
     if not episode.explored.all():
         return "in which not every action explored"
     if not episode.acted.all() or episode.fell_back.any():
@@ -107,21 +135,22 @@ def _why_not_sent(episode: Episode) -> str | None:
     return None
 
 
-def _rewards(episode: Episode, reward: Reward) -> NDArray[np.float64]:
-    """Return each action's reward by the user's function; the last one needs the observation after it."""
+def _computed(episode: Episode, reward: Reward) -> list[tuple[float, bool]]:
+    """Return each action's reward and whether it ended the episode; the last one needs the observation after it."""
     contract = episode.policy.contract
     final: Columns | None = episode.final_obs
-    if final is None:
-        return np.full(len(episode), np.nan)
     seen = [row_of(contract.observation_space, episode.obs, row, "obs") for row in range(len(episode))]
-    seen.append(row_of(contract.observation_space, final, 0, "obs"))
-    actions = [row_of(contract.action_space, episode.action, row, "action") for row in range(len(episode))]
+    if final is not None:
+        seen.append(row_of(contract.observation_space, final, 0, "obs"))
+    found = []
     try:
-        return np.array(
-            [float(reward(seen[row], action, seen[row + 1])) for row, action in enumerate(actions)], np.float64
-        )
+        for row, after in enumerate(seen[1:]):
+            result = reward(seen[row], row_of(contract.action_space, episode.action, row, "action"), after)
+            value, ended = result if isinstance(result, tuple) else (result, False)
+            found.append((float(value), bool(ended)))
     except Exception as error:  # the user's own code
         raise UsageError(f"the reward function failed: {first_line(error)}") from error
+    return found
 
 
 def reward_of(source: str, name: str) -> Reward:
@@ -131,6 +160,20 @@ def reward_of(source: str, name: str) -> Reward:
         exec(compile(source, name, "exec"), namespace)
     except Exception as error:
         raise UsageError(f"--reward {name} cannot be loaded: {first_line(error)}") from error
-    if not callable(reward := namespace.get("reward")):
-        raise UsageError(f"--reward {name}: expected a function reward(obs, action, next_obs) in it")
-    return cast(Reward, reward)
+    return _function(namespace.get("reward"), f"--reward {name}", "reward")
+
+
+def named_reward(name: str) -> Reward:
+    """Return the function that a contract names, `module:function`. Raises UsageError where there is none."""
+    module, _, function = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), function, None)
+    except Exception as error:
+        raise UsageError(f"the contract's reward function {name} cannot be loaded: {first_line(error)}") from error
+    return _function(found, f"the contract's reward function {name}", function)
+
+
+def _function(found: Any, where: str, name: str) -> Reward:
+    if not callable(found):
+        raise UsageError(f"{where}: expected a function {name}(obs, action, next_obs) in it")
+    return cast(Reward, found)

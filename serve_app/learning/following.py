@@ -1,7 +1,8 @@
 """Recordings followed while servers write them: each episode once, as soon as it has ended.
 
 Every poll reads what was added to the files since the last one, to the last whole chunk. A file that cannot be read is
-left out with one sentence, and the others continue.
+left out with one sentence, and the others continue. A remote server's files are copied first, by what was added. No two
+files' clocks are compared: those of servers may differ.
 """
 
 from __future__ import annotations
@@ -10,10 +11,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
+from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.recording.episodes import Episode, EpisodeAssembler
 from rlservo.serve_app.recording.reader import FileFacts, FileReader, Recording, RecordingError
 from rlservo.serve_app.recording.recorder import FILE_NAME, SUFFIX
+
+SILENT_NS = 60_000_000_000
+"""An episode without an end is over after this, by its file's clock: no more than a minute passes between decisions."""
 
 
 @dataclass(frozen=True)
@@ -27,15 +32,48 @@ class Ended:
     episode: Episode
 
 
+class ServerRecordings:
+    """A copy of the recordings of a server elsewhere: what it deletes is deleted here as well."""
+
+    def __init__(self, connect: Callable[[], AdminClient], folder: Path) -> None:
+        """`connect` makes a client with the admin key as it is then; the copy is in `folder`."""
+        self._connect, self.folder = connect, folder.absolute()
+        self.folder.mkdir(parents=True, exist_ok=True)
+
+    def update(self) -> None:
+        """Fetch what the server has recorded since the last time. Raises RlservoError."""
+        with self._connect() as client:
+            there = client.recordings()
+            for name, size in there.items():
+                if not FILE_NAME.match(name):
+                    raise UnavailableError(f"the server names a recording {name[:100]!r}: is it rlservo?")
+                with (self.folder / name).open("ab") as file:
+                    while file.tell() < size and (piece := client.recording(name, file.tell())):
+                        file.write(piece)
+        for path in self.folder.glob(f"*{SUFFIX}"):
+            if path.name not in there:
+                path.unlink()
+
+
 class FollowedRecordings:
     """Folders in which servers record."""
 
-    def __init__(self, folders: Sequence[Path], notify: Callable[[str], object]) -> None:
-        """`notify` gets one sentence for each file that cannot be read. Raises UsageError if it is not a folder."""
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        notify: Callable[[str], object],
+        servers: Sequence[ServerRecordings] = (),
+        progress: Callable[[str], object] = str,
+    ) -> None:
+        """`notify` gets one sentence for each file that cannot be read, `progress` which server is waited for.
+
+        Raises UsageError if a folder does not exist.
+        """
         for folder in folders:
             if not folder.is_dir():
                 raise UsageError(f"--recordings {folder}: expected the folder in which a server records (--record)")
-        self._folders = [folder.absolute() for folder in folders]
+        self._servers, self._progress = servers, progress
+        self._folders = [*(folder.absolute() for folder in folders), *(server.folder for server in servers)]
         self._notify = notify
         self._policies = Recording([])  # one object for the same policy of several files
         self._files: dict[Path, tuple[FileFacts, FileReader, int]] = {}
@@ -46,7 +84,12 @@ class FollowedRecordings:
         return {str(path) for path in self._paths()}
 
     def poll(self) -> Iterator[Ended]:
-        """Yield the episodes that have ended since the last poll."""
+        """Yield the episodes that have ended since the last poll. Raises RlservoError where a server refuses."""
+        for server in self._servers:
+            try:
+                server.update()
+            except (UnavailableError, DeadlineError) as error:
+                self._progress(f"waiting for recordings: {error.message}")
         for path in self._paths():
             facts, reader, size = self._files.get(path) or self._open(path)
             try:
@@ -59,7 +102,7 @@ class FollowedRecordings:
             assembler = self._writers.setdefault(_writer_of(path), EpisodeAssembler())
             try:
                 for entry in reader.entries():
-                    for episode in assembler.add(entry):
+                    for episode in (*assembler.add(entry), *assembler.give_up(entry.log_time_ns - SILENT_NS)):
                         yield Ended(str(path), f"{episode.id}@{episode.wall_ns[0]}", episode)
             except RecordingError as error:
                 facts.damage = error.message

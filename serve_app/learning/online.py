@@ -7,24 +7,25 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from rlservo.export.contract.errors import BundleError, CheckpointError, ParityError, UnsupportedError
+from rlservo.export.contract.errors import BundleError, CheckpointError, ParityError, UnsupportedError, UsageError
 from rlservo.serve_app.learning.admission import Admission, Admitted, KnownVersion
 from rlservo.serve_app.learning.following import FollowedRecordings
 from rlservo.serve_app.learning.release import Release
 from rlservo.serve_app.learning.rllib_episodes import single_agent_episode
 from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 from rlservo.serve_app.learning.run_folder import RunFolder
+from rlservo.serve_app.recording.episodes import Episode
 
 POLL_S = 0.5
 KEPT_LOADED = 3  # versions besides those that may be learned from: robots finish their episodes with them
 GATE = (ParityError, CheckpointError, UnsupportedError, BundleError)
 """The errors by which an export refuses a version."""
-NOT_PROVEN = "learned by a version that the gate refused"
 
 
 @dataclass
@@ -53,7 +54,6 @@ class OnlineLearning:
         release: Release,
         *,
         every: int,
-        max_age: int,
         say: Callable[[str], object],
         progress: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
@@ -61,20 +61,26 @@ class OnlineLearning:
         """Release a version every `every` updates; `say` takes a line per event, `progress` the current activity."""
         self._learner, self._run, self._recordings = learner, run, recordings
         self._admission, self._release = admission, release
-        self._every, self._max_age = every, max_age
+        self._every = every
         self._say, self._progress, self._sleep = say, progress, sleep
         self._used = {(file, key) for file, keys in run.state.used.items() for key in keys}
+        self._unproven: list[str] = []
+        """Episodes that were learned from since the newest version, by key."""
+        self._fresh = 0
+        """The same, counted: a recorded episode may be several."""
         self._source = self._admitted()
 
     def run(self, versions: int | None = None) -> None:
         """Learn until this number of further versions was released, or interrupted. Raises RlservoError."""
         state = self._run.state
         if self._run.is_new:
-            self._begin()
+            self._release.check_unclaimed()
+            self._keep(self._release.publish(self._learner.save))
+            self._say(f"version {state.versions[-1].version} is the checkpoint itself")
         else:
+            self._learner.restore(self._run.checkpoint(state.versions[-1].version))
+            self._serve_newest()
             newest = state.versions[-1].version
-            self._learner.restore(self._run.checkpoint(newest))
-            self._release.serve(newest, self._before(len(state.versions) - 1))
             self._say(f"continues from version {newest}: {state.updates} updates, {state.episodes} episodes used")
         released = 0
         while versions is None or released < versions:
@@ -84,43 +90,65 @@ class OnlineLearning:
 
     # Versions.
 
-    def _begin(self) -> None:
-        """Release the checkpoint itself: the version that robots begin with is one that this run knows."""
-        known = self._release.publish(self._learner.save)
-        self._keep(known)
-        self._say(f"version {known.version} is the checkpoint itself")
-
     def _make_version(self) -> bool:
-        """Release the learned version; return whether the gate passed it. If not, continue from the last version."""
-        state = self._run.state
+        """Release the learned version; return whether robots get it. If not, continue from the last version."""
         try:
             known = self._release.publish(self._learner.save)
         except GATE as error:
-            newest = state.versions[-1].version
-            self._say(f"no version was released, the gate refused it: {error.message}")
-            self._learner.restore(self._run.checkpoint(newest))
-            state.refused += 1
-            state.dropped[NOT_PROVEN] += self._every
-            self._run.commit(self._recordings.names())
-            self._say(f"learning continues from version {newest}")
+            self._refuse(f"the gate refused it: {error.message}")
             return False
-        self._keep(known)
-        self._say(f"version {known.version} is proven, published and loaded after {state.updates} updates")
+        if not self._keep(known):
+            return False
+        self._say(f"version {known.version} is proven, published and loaded after {self._run.state.updates} updates")
         return True
 
-    def _keep(self, known: KnownVersion) -> None:
+    def _keep(self, known: KnownVersion) -> bool:
+        """Note a version, and let robots have it; return whether they do."""
         state = self._run.state
         state.versions.append(known)
         self._run.commit(self._recordings.names())
-        self._release.serve(known.version, self._before(len(state.versions) - 1))
-        too_old = len(state.versions) - self._max_age - KEPT_LOADED
+        if not self._serve_newest():
+            return False
+        self._forget_unproven()
+        too_old = len(state.versions) - self._admission.max_age - KEPT_LOADED
         if too_old > 0:
             old = state.versions[too_old - 1].version
             self._learner.forget(self._run.checkpoint(old))
             self._release.unload(old)
+        return True
 
-    def _before(self, place: int) -> str | None:
-        return self._run.state.versions[place - 1].version if place > 0 else None
+    def _serve_newest(self) -> bool:
+        """Let robots have the newest version; continue without it if the server or its canary refused it.
+
+        Raises UsageError if it is the first, the checkpoint itself.
+        """
+        versions = self._run.state.versions
+        newest = versions[-1].version
+        reason = self._release.serve(newest, versions[-2].version if len(versions) > 1 else None)
+        if reason is None:
+            return True
+        if len(versions) == 1:
+            raise UsageError(f"robots do not get version {newest}, the checkpoint itself: {reason}")
+        versions.pop()
+        self._refuse(f"robots do not get version {newest}: {reason}")
+        self._release.unload(newest)
+        return False
+
+    def _refuse(self, why: str) -> None:
+        """Learn on from the last version, without what was learned since."""
+        state = self._run.state
+        newest = state.versions[-1].version
+        self._say(f"no version was released, {why}")
+        self._learner.restore(self._run.checkpoint(newest), forget=self._fresh)
+        state.unproven += self._unproven
+        self._forget_unproven()
+        state.refused += 1
+        self._run.commit(self._recordings.names())
+        self._say(f"learning continues from version {newest}")
+
+    def _forget_unproven(self) -> None:
+        self._unproven.clear()
+        self._fresh = 0
 
     # Updates.
 
@@ -129,15 +157,13 @@ class OnlineLearning:
         batch = self._draw()
         raw, seen = [], []
         for number, one in enumerate(batch.admitted):
-            made = single_agent_episode(
-                one.episode, one.episode.own_action, one.rewards, id_=f"{state.episodes + number}",
-                with_distribution=True,
-            )  # fmt: skip
+            made = _made(one, f"{state.episodes + number}")
             raw.append(made)
             seen += self._learner.seen([made], self._run.checkpoint(one.version.version))
         losses = self._learner.update(raw, seen, state.steps)
         state.updates += 1
         state.episodes += len(batch.admitted)
+        self._fresh += len(batch.admitted)
         state.steps += batch.steps
         acted = Counter(one.version.version for one in batch.admitted)
         returns, ages = [one.rewards.sum() for one in batch.admitted], [one.age for one in batch.admitted]
@@ -151,7 +177,8 @@ class OnlineLearning:
     def _draw(self) -> _Batch:
         """Return the episodes of the next update; wait for them."""
         batch = _Batch()
-        while batch.steps < self._learner.batch_size:
+        wanted = self._learner.steps_wanted
+        while batch.steps < wanted:
             one = next(self._source)
             if isinstance(one, Admitted):
                 batch.admitted.append(one)
@@ -161,8 +188,7 @@ class OnlineLearning:
                 self._run.state.dropped[one] += 1
             else:
                 self._progress(
-                    f"waiting for exploring episodes: {batch.steps} of {self._learner.batch_size} steps, dropped "
-                    f"{batch.dropped_text}"
+                    f"waiting for exploring episodes: {batch.steps} of {wanted} steps, dropped {batch.dropped_text}"
                 )
                 self._sleep(POLL_S)
         return batch
@@ -172,15 +198,34 @@ class OnlineLearning:
         state = self._run.state
         while True:
             for ended in self._recordings.poll():
-                if (ended.file, ended.key) in self._used:
+                place, parts = (ended.file, ended.key), self._admission.parts(ended.episode)
+                if place in self._used:
+                    self._remember(ended.key, parts)
                     continue
-                verdict = self._admission.judge(ended.episode, state.versions)
-                if verdict is None:
+                verdicts = [self._admission.judge(part, state.versions) for part in parts]
+                if not any(verdicts):  # another policy's
                     continue
-                self._used.add((ended.file, ended.key))
+                self._used.add(place)
                 state.used.setdefault(ended.file, []).append(ended.key)
-                yield verdict
+                if any(isinstance(verdict, Admitted) for verdict in verdicts):
+                    self._unproven.append(ended.key)
+                yield from verdicts
             yield None
+
+    def _remember(self, key: str, parts: Sequence[Episode]) -> None:
+        """Give an episode of before a restart back to a learner that replays."""
+        state = self._run.state
+        if not self._learner.replays or key in state.unproven:
+            return
+        for number, part in enumerate(parts):
+            one = self._admission.judge(part, state.versions, any_age=True)
+            if isinstance(one, Admitted):
+                made = _made(one, f"{key}.{number}")
+                self._learner.remember(self._learner.seen([made], self._run.checkpoint(one.version.version)))
+
+
+def _made(one: Admitted, id_: str) -> Any:
+    return single_agent_episode(one.episode, one.episode.own_action, one.rewards, id_=id_, with_distribution=True)
 
 
 def why_interrupted(run: RunFolder) -> str:

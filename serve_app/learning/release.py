@@ -1,19 +1,31 @@
-"""Release of a version to a server: proven, published, loaded, and named by an alias."""
+"""Release of a version to a server: proven, published, loaded, and named by an alias or promoted by a canary."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from rlservo.export.contract.bundle import ONNX_FILE, Bundle, load_bundle
-from rlservo.export.contract.errors import ConflictError, DeadlineError, RlservoError, UnavailableError, UsageError
+from rlservo.export.contract.errors import (
+    ConflictError,
+    DeadlineError,
+    RefusedError,
+    RlservoError,
+    UnavailableError,
+    UnknownPolicyError,
+    UsageError,
+)
 from rlservo.export.export_checkpoint import export_checkpoint, silent
 from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.learning.admission import KnownVersion
+from rlservo.serve_app.client.promotion import INTERRUPTED, PRODUCTION, PROMOTED, ROLLED_BACK, Promotion, Terms
+from rlservo.serve_app.client.promotion_evidence import Limits
+from rlservo.serve_app.client.promotion_log import PromotionLog
+from rlservo.serve_app.learning.admission import KnownVersion, Reward, named_reward
 from rlservo.serve_app.learning.run_folder import RunFolder
 from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.repository.publication import next_version, publish
@@ -25,6 +37,17 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
+class Canary:
+    """How a version is watched before all robots get it."""
+
+    share: float
+    """Of the sessions."""
+    seconds: float
+    limits: Limits
+    every_s: float = 5.0
+
+
+@dataclass(frozen=True)
 class Target:
     """Destination of versions."""
 
@@ -32,6 +55,8 @@ class Target:
     repository: str
     """A folder or URI, one of the server's."""
     alias: str
+    canary: Canary | None = None
+    """Where given, versions go to production through a canary, and no alias is moved."""
 
 
 class Release:
@@ -43,13 +68,29 @@ class Release:
         run: RunFolder,
         connect: Callable[[], AdminClient],
         *,
+        url: str,
         app_dir: Path,
         progress: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`connect` makes a client with the admin key as it is then; `progress` takes the current activity."""
+        """`connect` makes a client of `url` with the admin key as it is then; `progress` takes the current activity."""
         self._target, self._run, self._connect = target, run, connect
+        self._url, self._reward = url, ""
         self._app_dir, self._progress, self._sleep = app_dir, progress, sleep
+
+    def named_reward(self) -> Reward | None:
+        """Return the reward function that the served policy's contract names, as this run's contracts then do.
+
+        None where it names none. Raises UsageError where it cannot be loaded.
+        """
+
+        def ask() -> str:
+            with self._connect() as client:
+                return str(client.contract(self._target.policy).get("reward", ""))
+
+        with suppress(UnknownPolicyError):  # served from its first version on
+            self._reward = self._until_reached(ask)
+        return named_reward(self._reward) if self._reward else None
 
     def publish(self, save: Callable[[Path], None]) -> KnownVersion:
         """Save a checkpoint under the next version's number, prove it and publish it.
@@ -64,7 +105,7 @@ class Release:
             self._progress(f"proving version {version}")
             result = export_checkpoint(
                 checkpoint, self._run.bundles, name=name, version=version, app_dir=self._app_dir,
-                untrained_filter=True, notify=silent,
+                untrained_filter=True, reward=self._reward, notify=silent,
             )  # fmt: skip
             bundle = load_bundle(result.path)
             try:
@@ -74,15 +115,31 @@ class Release:
             return _known(bundle)
         raise UsageError(f"{place}/{name}: others keep publishing versions; give the same command again")
 
-    def serve(self, version: str, before: str | None) -> None:
-        """Let the server load a version and point the alias to it; a repetition changes nothing.
-
-        `before` is this run's last target of the alias, None at its first version. Raises ConflictError where
-        someone else has moved it.
-        """
+    def check_unclaimed(self) -> None:
+        """Raise ConflictError if a new run's alias already points to a version: another learner may move it."""
         name, alias = self._target.policy, self._target.alias
-        self._until_reached(lambda: self._load(name, version))
-        self._until_reached(lambda: self._move(name, alias, version, before))
+        there = None if self._target.canary else self._until_reached(lambda: self._aliases().get(alias))
+        if there is not None:
+            raise ConflictError(
+                f"alias '{alias}' of policy '{name}' already leads to version {there}: is another learner moving it? "
+                f"Give this one its own --alias, or remove a left-over one with 'rlservo policy alias {name} {alias}='"
+            )
+
+    def serve(self, version: str, before: str | None) -> str | None:
+        """Let the server load a version and robots have it; done already, it changes nothing.
+
+        `before` is where this run has let the alias lead, None at its first version. Returns why the server refused the
+        version or its canary was rolled back, None where robots have it. Raises ConflictError where someone else
+        changes what is served.
+        """
+        try:
+            self._until_reached(lambda: self._load(version))
+        except RefusedError as error:
+            return error.message
+        if self._target.canary is not None:
+            return self._promote(version, self._target.canary)
+        self._until_reached(lambda: self._move(version, before))
+        return None
 
     def unload(self, version: str) -> None:
         """Let the server unload a version that robots no longer need, unless something still points to it."""
@@ -92,22 +149,47 @@ class Release:
         except RlservoError as error:
             self._progress(f"version {version} stays loaded: {error.message}")
 
-    def _load(self, name: str, version: str) -> None:
+    def _load(self, version: str) -> None:
         with self._connect() as client:
-            client.load(name, version)
+            client.load(self._target.policy, version)
 
-    def _move(self, name: str, alias: str, version: str, before: str | None) -> None:
+    def _aliases(self) -> dict[str, str]:
         with self._connect() as client:
-            served = next((one for one in client.listing()["policies"] if one["name"] == name), None)
-            there = (served or {}).get("aliases", {}).get(alias)
-            if there == version:
-                return
-            if there is not None and before is not None and there != before:
-                raise ConflictError(
-                    f"alias '{alias}' of policy '{name}' leads to version {there}, but this run had moved it to "
-                    f"{before}: is another learner moving it? Give each its own --alias"
-                )
+            served: dict[str, dict[str, str]] = {one["name"]: one["aliases"] for one in client.listing()["policies"]}
+        return served.get(self._target.policy, {})
+
+    def _move(self, version: str, before: str | None) -> None:
+        name, alias = self._target.policy, self._target.alias
+        there = self._aliases().get(alias)
+        if there == version:
+            return
+        if there not in (None, before):
+            raise ConflictError(
+                f"alias '{alias}' of policy '{name}' leads to version {there}, but this run had moved it to "
+                f"{before}: is another learner moving it? Give each its own --alias"
+            )
+        with self._connect() as client:
             client.alias(name, alias, version, expected=there)
+
+    def _promote(self, version: str, canary: Canary) -> str | None:
+        """Put a version into production by `rlservo policy promote`, from where its log ends."""
+        name, log = self._target.policy, self._run.path / "promotions" / f"{version}.jsonl"
+        if self._until_reached(lambda: self._aliases().get(PRODUCTION)) == version:
+            return None
+        terms = Terms((self._url,), name, version, canary.share, canary.seconds, canary.limits)
+        log.parent.mkdir(exist_ok=True)
+        with PromotionLog.open(log) as opened:
+            try:
+                outcome = Promotion(
+                    lambda _url: self._connect(), terms, opened, every_s=canary.every_s, say=self._progress
+                ).run()
+            except UsageError as error:  # another canary, say: another learner's
+                raise ConflictError(f"version {version} was not promoted: {error.message}") from None
+        if outcome.outcome == INTERRUPTED:
+            raise KeyboardInterrupt
+        if outcome.outcome not in (PROMOTED, ROLLED_BACK):
+            raise ConflictError(f"version {version} was not promoted: {outcome.why}")
+        return outcome.why if outcome.outcome == ROLLED_BACK else None
 
     def _until_reached(self, change: Callable[[], Result]) -> Result:
         """Return the result of `change`, tried until the server or the storage is reachable."""

@@ -101,7 +101,7 @@ def why_not_whole(episode: Episode) -> str | None:
 
 def why_without_reward(episode: Episode, rewards: NDArray[np.float64]) -> str | None:
     """Return the reason why an episode's return is unknown; None if it is known."""
-    if not np.isfinite(rewards).all():
+    if not (np.abs(rewards) <= np.finfo(np.float32).max).all():  # the learner computes in float32
         return "without every reward"
     if not episode.terminated and episode.final_obs is None:
         return "cut off, without the observation after the last action"

@@ -13,19 +13,24 @@ from typing import Any, cast
 
 import numpy as np
 from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.algorithms.impala.impala_learner import IMPALALearner
 from ray.rllib.connectors.env_to_module import EnvToModulePipeline
 from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.learner.learner import Learner
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
-from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
+from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME, NUM_ENV_STEPS_TRAINED_LIFETIME
 
 from rlservo.export.checkpoints.facts import read_facts
 from rlservo.export.checkpoints.location import CTOR_FILE, CheckpointFiles, locate_checkpoint
 from rlservo.export.checkpoints.unpickle import unpickle
 from rlservo.export.contract.errors import CheckpointError, RlservoError, UnsupportedError, UsageError, first_line
 from rlservo.serve_app.learning.rllib_episodes import through_connectors
+from rlservo.serve_app.learning.rllib_replay import Replay
 
-ALGORITHMS = ("PPO",)
+ALGORITHMS = {"PPO": 1, "APPO": 3, "SAC": 10}
+"""The oldest version that each learns from by default, in versions behind the newest: PPO clips the ratio to it, APPO
+corrects by V-trace, SAC replays."""
 LEARNER_GROUP = "learner_group"
 
 
@@ -38,7 +43,11 @@ class OnlineLearner:
         Raises CheckpointError, UnsupportedError and UsageError.
         """
         self._files = _files_of(start)
-        self._config = _config_of(self._files)
+        algorithm, self._config = _config_of(self._files)
+        self.max_age = ALGORITHMS[algorithm]
+        """Versions that may have come after the one that acted, by default."""
+        self._replay = Replay(self._config) if algorithm == "SAC" else None
+        self._epochs = _epochs(self._config)
         self.batch_size = batch_size or self._config.total_train_batch_size
         pipeline = self._pipeline(self._files.root)
         spaces = (pipeline.observation_space, pipeline.input_action_space)
@@ -52,8 +61,28 @@ class OnlineLearner:
         self._env_to_module = pipeline
         self.restore(self._files.root)
 
-    def restore(self, checkpoint: Path) -> None:
-        """Continue from another checkpoint of this learner. Raises CheckpointError."""
+    @property
+    def replays(self) -> bool:
+        """Whether episodes are learned from again and again."""
+        return self._replay is not None
+
+    @property
+    def steps_wanted(self) -> int:
+        """Steps of new episodes that the next update takes."""
+        return max(self.batch_size, self._replay.missing if self._replay else 0)
+
+    def remember(self, seen: Sequence[SingleAgentEpisode]) -> None:
+        """Take episodes back that were learned from before a restart."""
+        if self._replay is not None:
+            self._replay.add(seen)
+
+    def restore(self, checkpoint: Path, forget: int = 0) -> None:
+        """Continue from another checkpoint of this learner, without its newest `forget` episodes.
+
+        Raises CheckpointError.
+        """
+        if self._replay is not None and forget:
+            self._replay.forget(forget)
         try:
             self._group.restore_from_path(str(checkpoint.absolute() / LEARNER_GROUP))
         except Exception as error:  # a damaged file raises almost anything
@@ -77,20 +106,39 @@ class OnlineLearner:
 
         `steps` are the environment steps learned from before. Raises RlservoError with the cause.
         """
+        new, replay = sum(map(len, seen)), self._replay
+        if replay is not None:
+            replay.add(seen)
+        count = 1 if replay is None else replay.updates(new)
+        found: Any = {}
+        for number in range(count):
+            at = self._first_steps + steps + new * number // count
+            try:
+                found = self._learn(list(seen) if replay is None else replay.draw(), at)
+            except Exception as error:  # the user's own learner or connectors among it
+                raise RlservoError(f"learning failed: {first_line(error)}") from error
+        through_connectors(raw, self._env_to_module, learn=True)
+        return {name: float(np.asarray(found[name].peek())) for name in found if "loss" in name}
+
+    def _learn(self, episodes: Any, at: int) -> Any:
+        """Let RLlib's learner take a step at `at` environment steps; return its results."""
         config = cast(Any, self._config)
-        try:
-            results = self._group.update(
-                episodes=list(seen),
-                timesteps={NUM_ENV_STEPS_SAMPLED_LIFETIME: self._first_steps + steps},
-                num_epochs=config.num_epochs,
+
+        def step(learner: Learner, *_: Any) -> Any:
+            # APPO's own `update` hands a batch to a thread, which calls this one, and does not wait for it.
+            update = Learner.update if isinstance(learner, IMPALALearner) else type(learner).update
+            return update(
+                learner,
+                episodes=episodes,
+                timesteps={NUM_ENV_STEPS_SAMPLED_LIFETIME: at, NUM_ENV_STEPS_TRAINED_LIFETIME: at},
+                num_epochs=self._epochs,
                 minibatch_size=config.minibatch_size,
                 shuffle_batch_per_epoch=config.shuffle_batch_per_epoch,
             )
-        except Exception as error:  # the user's own learner or connectors among it
-            raise RlservoError(f"learning failed: {first_line(error)}") from error
-        through_connectors(raw, self._env_to_module, learn=True)
-        found = results[0][DEFAULT_MODULE_ID]
-        return {name: float(np.asarray(found[name].peek())) for name in found if "loss" in name}
+
+        (result,) = self._group.foreach_learner(step)
+        found: Any = result.get()
+        return found[DEFAULT_MODULE_ID]
 
     def save(self, folder: Path) -> None:
         """Write a checkpoint of the whole algorithm: RLlib trains on from it, and `rlservo export` takes it.
@@ -134,7 +182,14 @@ def _files_of(checkpoint: Path) -> CheckpointFiles:
     return files
 
 
-def _config_of(files: CheckpointFiles) -> AlgorithmConfig:
+def _epochs(config: Any) -> int:
+    """Return how often a batch is learned from: of APPO also as often as its buffer would give it out."""
+    rounds = config.circular_buffer_iterations_per_batch if getattr(config, "use_circular_buffer", False) else 1
+    return int(config.num_epochs * rounds)
+
+
+def _config_of(files: CheckpointFiles) -> tuple[str, AlgorithmConfig]:
+    """Return the algorithm's name and its configuration."""
     opened = unpickle(files.root / CTOR_FILE)
     algorithm = opened["class"]
     if algorithm.__name__ not in ALGORITHMS:
@@ -147,4 +202,4 @@ def _config_of(files: CheckpointFiles) -> AlgorithmConfig:
     config = given if isinstance(given, AlgorithmConfig) else algorithm.get_default_config().from_state(given)
     config = config.copy(copy_frozen=False)
     config.learners(num_learners=0, num_gpus_per_learner=0)
-    return cast(AlgorithmConfig, config)
+    return algorithm.__name__, cast(AlgorithmConfig, config)

@@ -21,6 +21,7 @@ from rlservo.serve_app.interface import Closeable
 from rlservo.serve_app.learning.admission import KnownVersion
 
 STATE_FILE, LOCK_FILE, REWARD_FILE = "learn.json", ".lock", "reward.py"
+FOLDERS = ("bundles", "checkpoints", "followed", "promotions")
 
 
 @dataclass
@@ -39,7 +40,9 @@ class State:
     dropped: Counter[str] = field(default_factory=Counter)
     """Episodes by the reason why nothing was learned from them."""
     refused: int = 0
-    """Versions that the gate refused."""
+    """Versions that the gate refused, or whose canary was rolled back."""
+    unproven: list[str] = field(default_factory=list)
+    """The used episodes that those had learned from."""
 
 
 class RunFolder(Closeable):
@@ -102,7 +105,7 @@ class RunFolder(Closeable):
 
     def _check_ours(self) -> None:
         """Raise UsageError for a folder with other content than a run's."""
-        ours = {LOCK_FILE, REWARD_FILE, STATE_FILE, f"{STATE_FILE}.part", "bundles", "checkpoints"}
+        ours = {LOCK_FILE, REWARD_FILE, STATE_FILE, f"{STATE_FILE}.part", *FOLDERS}
         others = sorted({entry.name for entry in self.path.iterdir()} - ours)
         if others:
             raise UsageError(f"--out {self.path} holds {others[0]}: expected a new folder, or that of a run")

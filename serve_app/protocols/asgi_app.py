@@ -10,6 +10,7 @@ from rlservo.serve_app.protocols import (
     json_codec,
     oip_infer,
     oip_models,
+    recording_routes,
     status_page,
     websocket_stream,
 )
@@ -46,7 +47,7 @@ def create_app(
         *json_codec.routes(handler),
         *websocket_stream.routes(handler),
         *_health(handler),
-        *(admin_routes.routes(handler, control) if control is not None else ()),
+        *((*admin_routes.routes(handler, control), *recording_routes.routes(handler)) if control is not None else ()),
         *oip_infer.routes(handler),
         *oip_models.routes(handler),
         *status_page.routes(),

@@ -109,6 +109,11 @@ class Episode:
         """Whether the action was drawn from the policy's distribution."""
         return np.array([one.get("explore", False) for one in self._decisions], np.bool_)
 
+    @property
+    def may_teach(self) -> bool:
+        """Whether all that was reported of it came with keys that may explore."""
+        return all(one is None or one.get("may_teach", True) for one in self._outcomes)
+
     @cached_property
     def own_action(self) -> Columns:
         """The module's own actions; zeros where `logp` is not a number."""
@@ -176,6 +181,19 @@ class Episode:
         """Return a field as it was recorded, such as `seq` or `request_id`; None if it is absent."""
         return [one.get(name) for one in self._decisions]
 
+    def part(self, begin: int, end: int, *, terminated: bool) -> Episode:
+        """Return rows `begin` to `end` (not included) as an episode; row `end` has the observation after it."""
+        rows = slice(begin, end)
+        outcomes = list(self._outcomes[rows])
+        if end < len(self):
+            outcomes[-1] = {**(outcomes[-1] or {}), "final_obs": self._decisions[end]["obs"]}
+        begins = self.begins if begin == 0 else not self.policy.contract.state  # a memory was not reset there
+        return Episode(
+            self.policy, self.id, begins=begins, ended=True, terminated=terminated,
+            truncated=not terminated, _decisions=self._decisions[rows], _outcomes=outcomes,
+            _log_times_ns=self._log_times_ns[rows], _wall_ns=self._wall_ns[rows],
+        )  # fmt: skip
+
     def _drop_last(self) -> None:
         for rows in (self._decisions, self._outcomes, self._log_times_ns, self._wall_ns):
             rows.pop()
@@ -217,6 +235,11 @@ class EpisodeAssembler:
         if len(self.opened) > MOST_OPEN:
             yield self.opened.popitem(last=False)[1]
 
+    def give_up(self, before_ns: int) -> Iterator[Episode]:
+        """Yield the open episodes whose last decision came before a log time."""
+        while self.opened and next(iter(self.opened.values()))._log_times_ns[-1] < before_ns:
+            yield self.opened.popitem(last=False)[1]
+
 
 def _add_decision(
     opened: OrderedDict[tuple[int, str], Episode], key: tuple[int, str], entry: Entry
@@ -247,7 +270,9 @@ def _add_outcome(episode: Episode, fields: dict[str, Any]) -> None:
     """Attach an outcome to its decision: nearly always the last one."""
     for row in range(len(episode) - 1, -1, -1):
         if episode._decisions[row]["step"] == fields["step"]:
-            episode._outcomes[row] = {**(episode._outcomes[row] or {}), **fields}
+            before = episode._outcomes[row] or {}
+            teaches = before.get("may_teach", True) and fields.get("may_teach", True)
+            episode._outcomes[row] = {**before, **fields, "may_teach": teaches}
             break
         if episode._decisions[row]["step"] < fields["step"]:
             break

@@ -111,6 +111,7 @@ class LogFile:
             "truncated": record.truncated or None,
             "final_status": record.final_status,
             "robot": record.robot,
+            "may_teach": None if record.may_teach else False,
         }
         self._add_rows("outcome", record, columns, _members(ending))
 

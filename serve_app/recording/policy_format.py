@@ -272,6 +272,7 @@ def outcome_schema(policy: PolicyFormat) -> dict[str, Any]:
             "final_obs": {**policy.observations.schema(), "description": "The observation after the last action"},
             "commanded": {**policy.actions.schema(), "description": "What the robot was commanded instead"},
             "robot": _object("Of a real robot", _ROBOT),
+            "may_teach": {"type": "boolean", "description": "false: reported with a key that may not explore"},
         },
     )
 

@@ -71,6 +71,8 @@ class OutcomeRecord:
     """Command to the robot instead of the action."""
     robot: Mapping[str, Any] | None = None
     """State of a real robot, its changes, and the limits that applied."""
+    may_teach: bool = True
+    """Whether the key that reported it may explore: nothing is learned from what another key says."""
     rows: int = 1
     """Of the decision."""
     wall_ns: int = field(default_factory=time.time_ns)

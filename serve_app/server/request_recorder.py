@@ -108,6 +108,7 @@ class RequestRecorder:
             outcome = OutcomeRecord(
                 known, episode, step - 1, reward, ends and not said.truncated, ends and said.truncated,
                 said.final_status, obs if ends else None, said.last_action, rows=rows,
+                may_teach=request.may_explore,
             )  # fmt: skip
             self.recorder.record(outcome)
         if ends:

@@ -48,12 +48,14 @@ function makeSection({ name }, askContract) {
     curve: null,
     curveText: element("p", { class: "note" }),
     rates: [],
+    success: { line: drawing("polyline"), curve: null, text: element("p", { class: "note" }) },
     contract: element("div", { id: `${id}-contract` }),
     shown: null, // {version, showDrift} of the open contract
     askContract,
   };
   const size = { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none" };
   parts.curve = drawing("svg", { class: "curve", role: "img", ...size }, parts.line);
+  parts.success.curve = drawing("svg", { class: "curve", role: "img", ...size }, parts.success.line);
   const section = element(
     "section",
     { class: "policy", "aria-labelledby": id },
@@ -61,6 +63,7 @@ function makeSection({ name }, askContract) {
     parts.description,
     parts.facts,
     element("div", { class: "rates" }, parts.curve, parts.curveText),
+    element("div", { class: "rates" }, parts.success.curve, parts.success.text),
     versions.region,
     parts.contract,
   );
@@ -73,6 +76,7 @@ function updateSection(parts, policy, looks, at) {
   parts.description.hidden = policy.description === "";
   showFacts(parts.facts, factsOf(policy, looks));
   drawCurve(parts, looks.rate("rlservo_requests_total", { policy: policy.name, code: "ok" }), at);
+  drawSuccess(parts.success, successes(policy.name, looks));
   keep(
     parts.versions.body,
     policy.version_states,
@@ -193,6 +197,30 @@ function drawCurve(parts, rate, at) {
       : `${number(rate, 3)} requests a second; at most ${number(highest, 3)} in the last two minutes`;
   setText(parts.curveText, text);
   parts.curve.setAttribute("aria-label", `Curve: ${text}`);
+}
+
+/** Return [version, episodes that ended, share of success], the oldest version first, also of those unloaded since. */
+function successes(policy, looks) {
+  const ends = "rlservo_episode_ends_total";
+  const good = looks.totalBy(ends, "version", { policy, outcome: "success" });
+  const by = (version) => version.split(".").map(Number);
+  const order = ([a], [b]) => by(a).map((part, at) => part - (by(b)[at] ?? 0)).find(Boolean) ?? 0;
+  return [...looks.totalBy(ends, "version", { policy })]
+    .filter(([, count]) => count > 0)
+    .sort(order)
+    .map(([version, count]) => [version, count, (good.get(version) ?? 0) / count]);
+}
+
+function drawSuccess({ line, curve, text }, all) {
+  curve.parentElement.hidden = all.length === 0;
+  if (all.length === 0) return;
+  const x = (at) => (all.length > 1 ? (WIDTH * at) / (all.length - 1) : 0);
+  const y = (share) => HEIGHT - 1 - (HEIGHT - 2) * share;
+  line.setAttribute("points", all.map(([, , share], at) => `${x(at).toFixed(1)},${y(share).toFixed(1)}`).join(" "));
+  const say = ([version, episodes, share]) => `${number(100 * share, 3)}% of ${count(episodes)} with ${version}`;
+  const ends = all.length > 1 ? [all[0], all.at(-1)] : all;
+  setText(text, `Episodes that succeeded, by version: ${ends.map(say).join(", … ")}`);
+  curve.setAttribute("aria-label", `Curve: ${text.textContent}`);
 }
 
 async function toggleContract(parts, name, version) {

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.learning.admission import Admission, Admitted, KnownVersion, reward_of
+from rlservo.serve_app.learning.admission import Admission, Admitted, KnownVersion, named_reward, reward_of
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.recording.recorded_policy import WithRecording
@@ -72,6 +72,7 @@ def fell_back(policy: WithRecording) -> None:
         (acted([True, False, True], [1.0] * 3), "in which not every action explored"),
         (acted([True, True], [1.0, float("nan")]), "without every reward"),
         (acted([True, True], [1.0, float("inf")]), "without every reward"),
+        (acted([True, True], [1.0, 1e39]), "without every reward"),
         (acted([True], [1.0], final=False), "cut off, without the observation after the last action"),
         (fell_back, "in which a fallback acted"),
     ],
@@ -133,3 +134,34 @@ def test_a_reward_function_stands_in_for_what_clients_say(ur5: Path, tmp_path: P
     for source in ("x = 1", "def reward(:"):
         with pytest.raises(UsageError, match=r"--reward r\.py"):
             reward_of(source, "r.py")
+
+
+def silent(policy: WithRecording) -> None:
+    """A client that says nothing of what came of its actions."""
+    for step in range(6):
+        policy.act(np.full(27, step / 10, np.float32), explore=True)
+
+
+def test_a_reward_function_may_say_where_episodes_end(ur5: Path, tmp_path: Path) -> None:
+    episode = recorded(ur5, tmp_path / "run.mcap", silent)
+    source = "def reward(obs, action, next_obs):\n    return float(next_obs[0]), bool(next_obs[0] > 0.25)\n"
+    admission = Admission("ur5", max_age=0, reward=reward_of(source, "r.py"))
+    parts = admission.parts(episode)
+    assert [(len(part), part.terminated) for part in parts] == [(3, True), (1, True), (1, True)]
+    assert Admission("ur5", max_age=0).parts(episode) == [episode]
+    judged = [admission.judge(part, [known(episode)]) for part in parts]
+    assert [one.rewards.tolist() for one in judged if isinstance(one, Admitted)] == [
+        pytest.approx([0.1, 0.2, 0.3]), pytest.approx([0.4]), pytest.approx([0.5]),
+    ]  # fmt: skip
+    # Without an end anywhere the last decision is only the observation after the one before.
+    never = Admission("ur5", max_age=0, reward=reward_of("def reward(o, a, n):\n    return 1.0\n", "r.py"))
+    (whole,) = never.parts(episode)
+    admitted = never.judge(whole, [known(episode)])
+    assert isinstance(admitted, Admitted) and whole.truncated and admitted.rewards.tolist() == [1.0] * 5
+    assert whole.final_obs is not None and whole.final_obs["obs"][0, 0] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("name", ["no_such_module:reward", "math:no_such_function", "math:pi"])
+def test_a_contract_that_names_no_function_is_an_error(name: str) -> None:
+    with pytest.raises(UsageError, match=f"the contract's reward function {name}"):
+        named_reward(name)

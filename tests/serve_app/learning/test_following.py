@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.learning import following
 from rlservo.serve_app.learning.following import Ended, FollowedRecordings
 from rlservo.serve_app.recording.recorded_policy import WithRecording
 from rlservo.serve_app.recording.recorder import Recorder
@@ -75,6 +76,34 @@ def test_a_file_that_is_no_recording_is_named_once_and_the_others_are_read(
     followed = FollowedRecordings([tmp_path], said.append)
     assert len(polled(followed, 1)) == 1
     assert len(said) == 1 and "another.mcap is not an MCAP file: left out" in said[0]
+
+
+def test_the_clocks_of_servers_may_be_apart(
+    ur5: Path, tmp_path: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders, now = [tmp_path / name for name in "abc"], time.time_ns
+    for folder, days in zip(folders, (-3, 0, 400), strict=True):
+        with monkeypatch.context() as patched:
+            patched.setattr(time, "time_ns", lambda days=days: now() + days * 86_400_000_000_000)
+            with Recorder(folder) as recorder, WithRecording(Policy.load(ur5), recorder) as policy:
+                policy._episode = "cell"
+                act(policy, 2, ends=True)
+    found = polled(FollowedRecordings(folders, said.append), 3)
+    assert [len(each.episode) for each in found] == [2] * 3 and len({each.key for each in found}) == 3
+    assert [each.episode.gap for each in found] == [None] * 3 and said == []
+
+
+def test_an_episode_that_no_one_ends_comes_when_it_has_been_silent(
+    ur5: Path, tmp_path: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(following, "SILENT_NS", 0)
+    with Recorder(tmp_path) as recorder:
+        for _ in range(2):
+            with WithRecording(Policy.load(ur5), recorder) as policy:
+                for _ in range(3):
+                    policy.act(OBS, explore=True)
+    (found,) = polled(FollowedRecordings([tmp_path], said.append), 1)
+    assert len(found.episode) == 3 and not found.episode.ended
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:

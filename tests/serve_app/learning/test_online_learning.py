@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 import torch
@@ -21,14 +23,16 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.rl_module import RLModule
 
+from rlservo.export.contract.bundle import read_contract
 from rlservo.export.contract.errors import ConflictError, UsageError
-from rlservo.export.export_checkpoint import ExportResult
+from rlservo.export.export_checkpoint import ExportResult, export_checkpoint, silent
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.promotion_evidence import Limits
 from rlservo.serve_app.learning.admission import Admission
-from rlservo.serve_app.learning.following import FollowedRecordings
+from rlservo.serve_app.learning.following import FollowedRecordings, ServerRecordings
 from rlservo.serve_app.learning.online import OnlineLearning
-from rlservo.serve_app.learning.release import Release, Target
+from rlservo.serve_app.learning.release import Canary, Release, Target
 from rlservo.serve_app.learning.rllib_episodes import single_agent_episode
 from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 from rlservo.serve_app.learning.run_folder import RunFolder
@@ -43,6 +47,7 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 ROBOT, ROBOT_LINE = new_key("robot", explore=True)
 ADMIN, ADMIN_LINE = new_key("boss", admin=True)
+OTHER, OTHER_LINE = new_key("screen")
 LENGTH, BATCH = 8, 40  # steps of an episode, and of an update
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated.
@@ -60,27 +65,42 @@ class Cell:
     acted: list[str] = field(default_factory=list)
     """The version that acted in each episode."""
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    size: int = 3
+    """Of an observation."""
 
-    def play(self, reward: float = 1.0) -> None:
-        """Let the robot have an episode."""
-        with PolicyClient(self.url, "policy", version="learning", api_key=ROBOT, timeout_s=60) as policy:
+    def play(self, reward: float | None = 1.0, version: str | None = "learning") -> None:
+        """Let the robot have an episode; without a `reward` it reports none."""
+        with PolicyClient(self.url, "policy", version=version, api_key=ROBOT, timeout_s=60) as policy:
+            self.size = policy.contract.observation_space.shape[0]  # type: ignore[union-attr]
             for step in range(LENGTH):
                 policy.act(self._obs(), explore=True)
                 ends = step == LENGTH - 1
-                policy.outcome(reward if ends else 0.0, truncated=ends, final_obs=self._obs() if ends else None)
+                last = self._obs() if ends else None
+                policy.outcome(reward if ends or reward is None else 0.0, truncated=ends, final_obs=last)
             self.acted.append(policy.contract.version)
         time.sleep(0.2)  # the server's recorder flushes within a second
 
     def _obs(self) -> NDArray[np.float32]:
-        return self.rng.standard_normal(3).astype(np.float32)
+        return self.rng.standard_normal(self.size).astype(np.float32)
 
-    def learning(self, run: RunFolder, learner: OnlineLearner | None = None, **more: Any) -> OnlineLearning:
-        target = Target("policy", str(self.folder / "policies"), "learning")
-        release = Release(target, run, self.admin, app_dir=self.folder, progress=str)
+    def learning(
+        self,
+        run: RunFolder,
+        learner: OnlineLearner | None = None,
+        *,
+        canary: Canary | None = None,
+        follow: bool = False,
+        **more: Any,
+    ) -> OnlineLearning:
+        target = Target("policy", str(self.folder / "policies"), "learning", canary)
+        learner = learner or OnlineLearner(self.checkpoint, batch_size=BATCH)
+        folders = [] if follow else [self.folder / "recorded"]
+        servers = [ServerRecordings(self.admin, run.path / "followed")] if follow else []
+        release = Release(target, run, self.admin, url=self.url, app_dir=self.folder, progress=str)
         return OnlineLearning(
-            learner or OnlineLearner(self.checkpoint, batch_size=BATCH), run,
-            FollowedRecordings([self.folder / "recorded"], self.said.append), Admission("policy", max_age=1), release,
-            **{"every": 1, "max_age": 1, "say": self.said.append, "progress": str, "sleep": lambda s: self.play()}
+            learner, run, FollowedRecordings(folders, self.said.append, servers),
+            Admission("policy", max_age=learner.max_age, reward=release.named_reward()), release,
+            **{"every": 1, "say": self.said.append, "progress": str, "sleep": lambda s: self.play()}
             | more,
         )  # fmt: skip
 
@@ -103,14 +123,20 @@ def cell(
     controlled: Callable[..., AbstractContextManager[PlanFollower]],
     served: Callable[[Any], AbstractContextManager[int]],
     tmp_path: Path,
+    request: pytest.FixtureRequest,
 ) -> Iterator[Cell]:
-    shutil.copytree(exported(zoo / "pendulum").path, tmp_path / "policies" / "policy" / "1")
-    settings = ServerSettings(record=str(tmp_path / "recorded"), api_keys=f"{ROBOT_LINE},{ADMIN_LINE}")
+    name, _, reward = getattr(request, "param", "pendulum").partition("+")
+    checkpoint, policies = zoo / name, tmp_path / "policies"
+    if reward:
+        export_checkpoint(checkpoint, policies, name="policy", reward=reward, notify=silent, untrained_filter=True)
+    else:
+        shutil.copytree(exported(checkpoint).path, policies / "policy" / "1")
+    settings = ServerSettings(record=str(tmp_path / "recorded"), api_keys=f"{ROBOT_LINE},{ADMIN_LINE},{OTHER_LINE}")
     with (
         controlled(tmp_path / "policies") as control,
         served(create_app(lambda: control.store, settings, control=control)) as port,
     ):
-        yield Cell(f"http://127.0.0.1:{port}", tmp_path, zoo / "pendulum")
+        yield Cell(f"http://127.0.0.1:{port}", tmp_path, checkpoint)
 
 
 def test_robots_train_versions_that_reach_them_by_the_alias(cell: Cell) -> None:
@@ -184,6 +210,104 @@ def test_a_version_that_the_gate_refuses_reaches_no_robot(cell: Cell) -> None:
     assert set(cell.acted) == {"2"} and cell.aliases()["learning"] == "3"
 
 
+def test_an_episode_that_another_key_ends_teaches_nothing(cell: Cell) -> None:
+    """A key that may only act knows a robot's episode, and claims that it went well."""
+
+    def claim(_seconds: float) -> None:
+        if not cell.acted:
+            post = {"content-type": "application/json", "x-session-id": "cell-1"}
+            address = f"{cell.url}/v1/policies/policy/versions/2/act"
+            for key, more in ((ROBOT, {"explore": True}), (OTHER, {"reward": 1e6, "final_status": "success"})):
+                reply = httpx.post(
+                    address, json={"obs": [0.0] * 3, **more}, headers={**post, "authorization": f"Bearer {key}"}
+                )
+                assert reply.status_code == 200
+        cell.play()
+
+    with cell.run_folder() as run:
+        cell.learning(run, sleep=claim).run(versions=1)
+        assert run.state.dropped == {"of which a key without the role explore reported something": 1}
+        assert run.state.episodes == BATCH // LENGTH
+
+
+@pytest.mark.parametrize("cell", ["pendulum+cell_rewards:height"], indirect=True)
+def test_the_contract_may_name_the_reward_function(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    (cell.folder / "cell_rewards.py").write_text("def height(obs, action, next_obs):\n    return float(next_obs[0])\n")
+    monkeypatch.syspath_prepend(cell.folder)
+    with cell.run_folder() as run:
+        cell.learning(run, sleep=lambda s: cell.play(reward=None)).run(versions=1)
+        assert run.state.episodes == BATCH // LENGTH and not run.state.dropped
+    assert read_contract(cell.folder / "policies/policy/3").reward == "cell_rewards:height"
+
+
+@pytest.mark.parametrize("cell", ["appo"], indirect=True)
+def test_appo_learns_from_what_robots_did(cell: Cell) -> None:
+    with cell.run_folder() as run:
+        cell.learning(run, follow=True).run(versions=1)  # copied from the server, by what was added
+        assert run.state.episodes * LENGTH >= BATCH and not run.state.dropped
+        copies = {path.name: path.stat().st_size for path in (run.path / "followed").iterdir()}
+        assert copies and all((cell.folder / "recorded" / name).stat().st_size >= size for name, size in copies.items())
+    assert cell.aliases()["learning"] == "3"
+    graphs = {(cell.folder / "policies/policy" / v / "policy.onnx").read_bytes() for v in ("2", "3")}
+    assert len(graphs) == 2
+
+
+@pytest.mark.parametrize("cell", ["sac"], indirect=True)
+def test_sac_replays_what_it_learned_from_before_a_restart_and_forgets_what_was_refused(cell: Cell) -> None:
+    with cell.run_folder() as run:
+        cell.learning(run, BrokenOnce(cell.checkpoint, batch_size=BATCH)).run(versions=1)
+        assert run.state.refused == 1 and len(run.state.unproven) == BATCH // LENGTH
+        learned = run.state.episodes - len(run.state.unproven)
+    learner = Replayed(cell.checkpoint, batch_size=BATCH)
+    with cell.run_folder() as run:
+        cell.learning(run, learner).run(versions=1)
+    assert learner.remembered == learned > 0
+    assert cell.aliases()["learning"] == "4"
+
+
+class Replayed(OnlineLearner):
+    """Counts what is given back to it after a restart."""
+
+    remembered = 0
+
+    def remember(self, seen: Sequence[Any]) -> None:
+        super().remember(seen)
+        self.remembered += len(seen)
+
+
+def test_a_version_goes_to_production_by_its_canary_or_learning_goes_on(cell: Cell) -> None:
+    limits = Limits(error_rate=0.5, min_requests=1)
+    playing = threading.Event()
+
+    def play() -> None:
+        while not playing.wait(0.05):
+            cell.play(version=None)
+
+    robot = threading.Thread(target=play)
+    robot.start()
+    try:
+        with cell.run_folder() as run:
+            canary = Canary(1.0, 3.0, limits, every_s=0.2)
+            cell.learning(run, canary=canary, sleep=time.sleep).run(versions=1)
+            assert [known.version for known in run.state.versions] == ["2", "3"]
+            assert cell.aliases() == {"production": "3"}
+    finally:
+        playing.set()
+        robot.join()
+    for _ in range(BATCH // LENGTH):
+        cell.play(version=None)
+
+    def stop(line: str) -> None:
+        cell.said.append(line)
+        if line.startswith("learning continues"):
+            raise KeyboardInterrupt
+
+    with cell.run_folder() as run, pytest.raises(KeyboardInterrupt):  # no robot acts while it is watched
+        cell.learning(run, canary=canary, say=stop).run()
+    assert cell.aliases() == {"production": "3"} and "learning continues from version 3" in cell.said
+    assert any("robots do not get version 4: " in line for line in cell.said)
+
+
 def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
     with cell.run_folder() as run:
         with pytest.raises(UsageError, match="another process is learning in it"):
@@ -198,6 +322,12 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
         with pytest.raises(ConflictError, match="leads to version 1, but this run had moved it to 2"):
             cell.learning(run, sleep=play_and_move).run(versions=1)
     assert cell.aliases()["learning"] == "1"
+    with (
+        cell.run_folder("second") as run,
+        pytest.raises(ConflictError, match=r"already leads to version 1: .*policy alias policy learning='"),
+    ):
+        cell.learning(run).run(versions=1)
+    assert not (cell.folder / "policies/policy/4").exists()
 
 
 def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path) -> None:

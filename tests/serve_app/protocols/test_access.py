@@ -47,6 +47,8 @@ ADMIN_PATHS = (
     *(f"/v1/admin/policies/{{name}}/{command}" for command in COMMANDS),
     "/v2/repository/models/{name}/load",
     "/v2/repository/models/{name}/unload",
+    "/v1/admin/recordings",
+    "/v1/admin/recordings/{file}/{begin}",
 )
 # What programs are known to drop, to decode twice, to take for a slash, or to end a line or a path at.
 INSERTED = (
@@ -220,6 +222,7 @@ def paths(app: PolicyApp) -> list[tuple[str, str, Access]]:
     found = []
     for route in app.table.routes:
         path = route.path.replace("{name}", "ur5").replace("{version}", "1")
+        path = path.replace("{file}", "dom.js").replace("{begin}", "0")
         found.append(("GET" if route.method == WEBSOCKET else route.method, path, route.access))
     return found
 

@@ -241,6 +241,19 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
     assert not [request for request in tab.requests.values() if request.headers.get("Referer")]
 
 
+def test_the_page_shows_how_each_version_succeeds(tab: Tab, server: Served) -> None:
+    tab.visit(server.url)
+    tab.wait_for_text("Versions of ur5")
+    assert tab.evaluate("[...document.querySelectorAll('.rates')].filter(part => part.hidden).length") == 2
+    for version, endings in (("1", ["collision"] * 3 + ["success"]), ("2", ["success"] * 4)):
+        for status in endings:
+            end = {"obs": [0.0] * 27, "final_status": status}
+            assert httpx.post(f"{server.url}/v1/policies/ur5/versions/{version}/act", json=end).status_code == 200
+    tab.wait_for_text("Episodes that succeeded, by version: 25% of 4 with 1, … 100% of 4 with 2")
+    curves = "document.querySelector('#policy-ur5').parentElement.querySelectorAll('.rates polyline')"
+    assert tab.evaluate(f"{curves}[1].getAttribute('points')") == "0.0,26.5 240.0,1.0"
+
+
 def test_what_a_policy_says_of_itself_is_text(
     tab: Tab, box_policy: Callable[..., Path], served: Serve, tmp_path: Path
 ) -> None:

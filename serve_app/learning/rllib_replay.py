@@ -1,0 +1,60 @@
+"""Replay buffer of an off-policy learner: the newest episodes, drawn as RLlib's own algorithms draw their transitions.
+
+Transitions are drawn evenly, also where the checkpoint's configuration asks for priorities.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
+from ray.rllib.utils.replay_buffers.episode_replay_buffer import EpisodeReplayBuffer
+
+
+class Replay:
+    """Episodes as the network saw them, up to the configuration's capacity in steps."""
+
+    def __init__(self, config: Any) -> None:
+        """Take the sizes of an off-policy algorithm's configuration."""
+        self._config = config
+        self._capacity = int(config.replay_buffer_config["capacity"])
+        self._kept: deque[SingleAgentEpisode] = deque()
+        self._buffer = EpisodeReplayBuffer(capacity=self._capacity)
+
+    @property
+    def missing(self) -> int:
+        """Steps that the configuration wants to see before anything is learned."""
+        return max(0, int(self._config.num_steps_sampled_before_learning_starts) - sum(map(len, self._kept)))
+
+    def add(self, episodes: Sequence[SingleAgentEpisode]) -> None:
+        """Take the newest episodes in, and drop the oldest beyond the capacity."""
+        self._kept += episodes
+        while sum(map(len, self._kept)) > self._capacity and len(self._kept) > 1:
+            self._kept.popleft()
+        self._buffer.add(list(episodes))
+
+    def forget(self, count: int) -> None:
+        """Drop the newest `count` episodes."""
+        for _ in range(min(count, len(self._kept))):
+            self._kept.pop()
+        self._buffer = EpisodeReplayBuffer(capacity=self._capacity)
+        if self._kept:
+            self._buffer.add(list(self._kept))
+
+    def updates(self, steps: int) -> int:
+        """Return how often to learn for so many new steps: `training_intensity`, or once for each sampling."""
+        config = self._config
+        sampled = config.get_rollout_fragment_length() * config.num_envs_per_env_runner * max(1, config.num_env_runners)
+        per_step: float = (config.training_intensity or 0) / config.total_train_batch_size or 1 / sampled
+        return max(1, round(steps * per_step))
+
+    def draw(self) -> Any:
+        """Return the transitions of one update, each an episode of one step."""
+        config = self._config
+        drawn: Any = self._buffer.sample(
+            num_items=config.total_train_batch_size, n_step=config.n_step, batch_length_T=0, gamma=config.gamma,
+            sample_episodes=True,
+        )  # fmt: skip
+        return drawn
