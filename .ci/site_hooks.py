@@ -22,7 +22,9 @@ NOT_OBJECTS = {"__version__", "errors"}  # errors has a page of its own
 OPENAPI_PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>rlservo API</title>
 <meta name="viewport" content="width=device-width, initial-scale=1"><link rel="icon" href="data:,">
-<link rel="stylesheet" href="swagger/swagger-ui.css"></head>
+<link rel="stylesheet" href="swagger/swagger-ui.css"><style>
+.message.thrown, .errors small {overflow-wrap: anywhere; white-space: normal}
+</style></head>
 <body><div id="swagger-ui"></div><script src="swagger/swagger-ui-bundle.js"></script><script>
 SwaggerUIBundle({spec: %s, dom_id: "#swagger-ui", validatorUrl: null, supportedSubmitMethods: [],
   presets: [SwaggerUIBundle.presets.apis], layout: "BaseLayout"});

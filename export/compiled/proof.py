@@ -106,7 +106,7 @@ def prove(
 ) -> Proof:
     """Compile what is in `folder` and compare it with the graph. Raises ParityError, saying what differs."""
     flags = build(compiler, folder, prefix, library)
-    test = _run([str(folder / f"{prefix}_test")], folder)
+    test = _run([f"./{prefix}_test"], folder)
     if test.returncode != 0:
         first = (test.stdout.splitlines() or [f"exit code {test.returncode}"])[0]
         raise ParityError(f"the compiled policy does not reproduce the golden vectors: {first}")

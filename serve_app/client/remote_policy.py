@@ -224,7 +224,7 @@ class RemotePolicy(ActingPolicy):
         known = self._contract
         if contract.version not in self._contracts and known and known.control_rate_hz != contract.control_rate_hz:
             logger.warning(
-                "version %s of policy '%s' is made for %s Hz, and version %s for %s Hz",
+                "version %s of policy '%s' was made for %s Hz, but version %s for %s Hz",
                 contract.version, contract.name, contract.control_rate_hz, known.version, known.control_rate_hz,
             )  # fmt: skip
         self._contracts.setdefault(contract.version, contract)

@@ -41,7 +41,7 @@ class Draw:
 
 
 def distribution_size(distribution: Distribution, space: SpaceSpec) -> int:
-    """Return how many numbers per action `action_dist_inputs` must hold; 0 if the two do not belong together."""
+    """Return the number of values per action in `action_dist_inputs`; 0 if the two do not belong together."""
     leaves = leaf_specs(space, "action").values()
     kinds = {_leaf_kind(leaf, distribution) for leaf in leaves}
     nested = isinstance(space, DictSpec | TupleSpec)
