@@ -34,7 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "export/contract", "export/checkpoints", "export/recipe", "export/sources", "export/graph", "export/proof",
         "serve_app/rollout",
     },
-    "serve_app/repository": {"export/contract"},
+    "serve_app/repository": {"export/contract", "serve_app/wire"},
     "serve_app/learning": {
         "export", "export/contract", "export/checkpoints", "export/rllib", "serve_app/interface.py", "serve_app/client",
         "serve_app/recording", "serve_app/repository",
@@ -90,7 +90,9 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "aiohttp": (),
     "minari": ("serve_app/recording/minari_export.py",),
     "httpx": (),
-    "httpcore": ("serve_app/client/deadline_backend.py", "serve_app/client/http_transport.py"),
+    "httpcore": (
+        "serve_app/client/http_transport.py", "serve_app/repository/storage_http.py", "serve_app/wire/bounded_http.py",
+    ),
     "websockets": ("deploy/cockpit/page.py", "serve_app/client/websocket_connection.py"),
     "viser": ("deploy/cockpit/",),
     "trimesh": ("deploy/cockpit/meshes.py", "deploy/cockpit/scenery.py"),

@@ -164,10 +164,11 @@ def version_key(version: str) -> tuple[int, ...]:
     return parts + (0,) * (3 - len(parts))
 
 
-def first_fault(error: ValidationError) -> str:
-    """Return the first error in a document: `field: message`."""
+def first_fault(error: ValidationError, *, shows_input: bool = False) -> str:
+    """Return the first error in a document: `field: message`, and the input."""
     first = error.errors(include_url=False)[0]
-    return f"{'.'.join(str(part) for part in first['loc']) or 'the document'}: {first['msg']}"
+    given = f" (given: {first['input']!r:.80})" if shows_input else ""
+    return f"{'.'.join(str(part)[:80] for part in first['loc']) or 'the document'}: {first['msg']}{given}"
 
 
 def parse_contract(text: str, source: str) -> Contract:

@@ -11,10 +11,9 @@ import os
 import random
 import ssl
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
-from urllib.parse import SplitResult, quote, unquote, urlsplit
-from urllib.request import getproxies, proxy_bypass
+from urllib.parse import SplitResult, quote, urlsplit
 
 import numpy as np
 
@@ -24,9 +23,9 @@ from rlservo.export.contract.extras import needs_extra
 with needs_extra("client", what="the HTTP client"):
     import httpcore
 
-from rlservo.serve_app.client.deadline_backend import DeadlineBackend
 from rlservo.serve_app.client.replies import decode_error, excerpt
 from rlservo.serve_app.wire.addresses import host_of, parse_address
+from rlservo.serve_app.wire.bounded_http import FAILURES, DeadlineBackend, connection_pool
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 try:  # three times faster than the standard library on an image; not a requirement of the client
@@ -40,22 +39,8 @@ MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong UR
 LABEL = LABEL_HEADER.encode()
 KEEPALIVE_S = 5.0  # that an idle connection is kept
 SCHEMES = {"http": "http", "https": "https"}
-LOOPBACK = ("localhost", "127.0.0.1", "::1")
 PATH_CHARACTERS = "/%:@!$&'()*+,;=~"  # of a server's address, which stay as they are given
-PROXIES: dict[str, Callable[..., httpcore.ConnectionPool]] = {
-    "http": httpcore.HTTPProxy,
-    "https": httpcore.HTTPProxy,
-    "socks5": httpcore.SOCKSProxy,
-    "socks5h": httpcore.SOCKSProxy,
-}
 GATEWAYS = (500, 502)  # without an error of ours: the server behind has died, which Ray's HAProxy answers with 500
-FAILURES = (
-    httpcore.NetworkError,
-    httpcore.ProtocolError,
-    httpcore.ProxyError,
-    httpcore.TimeoutException,
-    httpcore.UnsupportedProtocol,
-)
 Headers = Sequence[tuple[bytes, bytes]]
 Reply = tuple[int, Headers, bytes]  # status, headers, body
 DROPS = (httpcore.RemoteProtocolError, httpcore.ReadError, httpcore.WriteError)
@@ -92,8 +77,9 @@ class Transport:
         if api_key is not None:
             self._headers.append((b"authorization", f"Api-Key {api_key}".encode()))
         self._backend = DeadlineBackend()
-        proxy = _proxy_of(self.url)
-        self._pool = _connection_pool(self.url, self._backend, proxy)
+        self._pool = connection_pool(
+            self.url, self._backend, _certificates, max_connections=100, keepalive_expiry=KEEPALIVE_S
+        )
         self._is_closed = False
         self.label: str | None = None
         """Label of the following requests, for the server's recording."""
@@ -248,28 +234,6 @@ def _retry_after_s(headers: Headers) -> float | None:
     return seconds if seconds >= 0 else None  # also refuses NaN
 
 
-def _connection_pool(url: str, backend: DeadlineBackend, proxy: str | None) -> httpcore.ConnectionPool:
-    """Return the connections to a server, through the environment's proxy."""
-    # Reading the certificates takes 20 ms; http has no use for them.
-    certificates = _certificates() if url.startswith("https") else None
-    options: dict[str, Any] = {
-        "ssl_context": certificates,
-        "max_connections": 100,
-        "keepalive_expiry": KEEPALIVE_S,
-        "network_backend": backend,
-    }
-    if proxy is None:
-        return httpcore.ConnectionPool(**options)
-    parts = urlsplit(proxy)
-    user = None if parts.username is None else (unquote(parts.username), unquote(parts.password or ""))
-    address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
-    if parts.scheme not in PROXIES:
-        raise UsageError(
-            f"a proxy in the environment variables begins with {parts.scheme!r}: expected an address such as 'http://proxy:3128'"
-        )
-    return PROXIES[parts.scheme](address, user, **options)
-
-
 def _certificates() -> ssl.SSLContext:
     """Return the certificates that servers are checked against: SSL_CERT_FILE's or SSL_CERT_DIR's, else certifi's."""
     file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
@@ -282,11 +246,3 @@ def _host_header(parts: SplitResult) -> bytes:
     host = host_of(parts)
     host = b"[%s]" % host if b":" in host else host
     return host if parts.port is None else b"%s:%d" % (host, parts.port)
-
-
-def _proxy_of(url: str) -> str | None:
-    """Return the proxy of HTTP_PROXY, HTTPS_PROXY and NO_PROXY; none for a server on this machine."""
-    parts = urlsplit(url)
-    if parts.hostname in LOOPBACK or proxy_bypass(parts.netloc):
-        return None
-    return getproxies().get(parts.scheme)

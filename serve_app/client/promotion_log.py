@@ -1,4 +1,4 @@
-"""Log of a promotion: JSON lines, each check with its figures and counts, from which a killed promotion continues."""
+"""Log of a promotion in JSON lines: each has its whole state, so that a killed promotion continues from the last."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from rlservo.export.contract.errors import UsageError
 
-START, CHECK, DECISION, END = "start", "check", "decision", "end"
+END = "end"
 
 
 class PromotionLog:
@@ -22,17 +22,14 @@ class PromotionLog:
     def __init__(self, path: Path, file: BinaryIO) -> None:
         """Read the promotion that has not ended. Raises UsageError for another kind of file."""
         self.path = path
-        self.entries: dict[str, dict[str, Any]] = {}  # the newest of each event, of the promotion that has not ended
         self._file = file
         *lines, torn = file.read().split(b"\n")
         self._is_torn = bool(torn)  # by a process that was killed while it wrote
-        for number, line in enumerate(lines):
-            try:
-                entry = json.loads(line)
-                self._add({**entry, "seconds": datetime.fromisoformat(entry["time"]).timestamp()})
-            except (ValueError, KeyError, TypeError):
-                if not number:
-                    raise UsageError(f"{path} is not a promotion's log: name another --log") from None
+        entries = [entry for line in lines if (entry := _entry(line)) is not None]
+        if lines and not entries:
+            raise UsageError(f"{path} is not a promotion's log: name another --log")
+        self.last = entries[-1] if entries and entries[-1]["event"] != END else None
+        """The newest entry of a promotion that has not ended."""
 
     @classmethod
     @contextlib.contextmanager
@@ -56,10 +53,9 @@ class PromotionLog:
                 if not os.fstat(file.fileno()).st_size:  # nothing was begun
                     path.unlink(missing_ok=True)
 
-    def write(self, event: str, **fields: Any) -> None:
+    def write(self, event: str, fields: dict[str, Any]) -> None:
         """Append an entry and sync it to disk: the next step may not be undone. Raises UsageError."""
-        now = datetime.now(timezone.utc)
-        entry = {"time": now.isoformat(timespec="milliseconds"), "event": event, **fields}
+        entry = {"time": datetime.now(timezone.utc).isoformat(timespec="milliseconds"), "event": event, **fields}
         content = b"\n" * self._is_torn + json.dumps(entry).encode() + b"\n"
         try:
             while content:
@@ -68,10 +64,11 @@ class PromotionLog:
             os.fsync(self._file)
         except OSError as error:  # for example a full disk
             raise UsageError(f"the log {self.path} cannot be written: {error.strerror}") from None
-        self._add({**entry, "seconds": now.timestamp()})
 
-    def _add(self, entry: dict[str, Any]) -> None:
-        if entry["event"] in (START, END):
-            self.entries.clear()
-        if entry["event"] == START or self.entries:
-            self.entries[entry["event"]] = entry
+
+def _entry(line: bytes) -> dict[str, Any] | None:
+    with contextlib.suppress(ValueError):
+        entry = json.loads(line)
+        if isinstance(entry, dict) and {"time", "event", "terms"} <= entry.keys():
+            return entry
+    return None

@@ -10,12 +10,14 @@ import io
 import re
 import time
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
-from rlservo.export.contract.extras import install
-from rlservo.serve_app.repository.storage_http import Reply, TooLongReplyError, request
+from rlservo.export.contract.extras import install, needs_extra
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.repository.storage_http import Reply
 
 PAGE = 2 << 20  # [bytes] of a list: 1,000 names of at most 1,024 bytes
 MOST_PAGES = 100
@@ -122,6 +124,8 @@ class ObjectStorage:
         most: int = 0,
     ) -> Reply:
         """Send a request, and once more if the connection breaks or the storage is busy."""
+        with needs_extra("remote", "httpcore"):
+            from rlservo.serve_app.repository.storage_http import TooLongReplyError, request
         place, timeout_s = f"{self.uri}/{name}", self.timeout_s
         headers = {header: given[key] for key, header in _CONDITIONS.items() if key in given}
         reason = ""

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rlservo.export.contract.bundle import DEFAULT_LIMITS, MAX_FILES, MAX_SUMS_BYTES, SUMS_FILE, BundleLimits, read_sums
-from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN
+from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault
 from rlservo.export.contract.errors import BundleError, BundleTamperedError
 from rlservo.serve_app.repository.bundle_cache import BundleCache
 from rlservo.serve_app.repository.object_storage import ObjectStorage
@@ -48,11 +48,7 @@ class Index(BaseModel):
         try:
             return cls.model_validate(json.loads(content))
         except (ValueError, RecursionError) as error:
-            reason = str(error)
-            if isinstance(error, ValidationError):
-                first = error.errors(include_url=False)[0]
-                where = ".".join(str(part)[:80] for part in first["loc"])
-                reason = f"{where}: {first['msg']} (given: {first['input']!r:.80})"
+            reason = first_fault(error, shows_input=True) if isinstance(error, ValidationError) else str(error)
             raise BundleError(f"{place} is not an index of versions: {reason[:300]}") from None
 
 

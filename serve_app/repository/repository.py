@@ -32,7 +32,7 @@ TIMEOUT_S = 30.0
 
 
 @dataclass
-class _Listing:
+class Listing:
     """Result of one look through all places."""
 
     found: dict[Key, tuple[str, str]] = field(default_factory=dict)  # (hash, where it is)
@@ -48,9 +48,56 @@ class _Listing:
                 "serve one of them, or export one under another name or version"
             )
 
+    @property
     def digests(self) -> dict[Key, str]:
-        """Return the hash of what can be served."""
+        """The hash of every bundle that can be served."""
         return {key: digest for key, (digest, _) in self.found.items() if key not in self.errors}
+
+    @property
+    def wrong(self) -> list[RlservoError]:
+        """Everything that cannot be served or read."""
+        return [*self.errors.values(), *self.unread]
+
+    def available(self, *, needs_all: bool) -> dict[str, dict[str, str]]:
+        """Return every bundle's hash by name and version, for a first plan.
+
+        With `needs_all` all that is there has to be good: raises BundleError or UsageError, and UnavailableError where
+        a storage does not answer.
+        """
+        if self.unread:
+            raise self.unread[0]
+        if needs_all:
+            raise_all(list(self.errors.values()))
+        hashes: dict[str, dict[str, str]] = {}
+        for (name, version), digest in sorted(self.digests.items(), key=lambda each: version_key(each[0][1])):
+            hashes.setdefault(name, {})[version] = digest
+        return hashes
+
+    def find(self, name: str, version: str | None) -> tuple[str, str]:
+        """Return (version, hash) of a bundle; None is the newest one.
+
+        Raises UnknownPolicyError or UnknownVersionError, what is wrong with the bundle of that name and version, and
+        UnavailableError if a storage that does not answer may have it.
+        """
+        digests = {v: digest for (n, v), digest in self.digests.items() if n == name}
+        versions = sorted(digests, key=version_key)
+        if self.unread and (version is None or version not in versions):
+            raise self.unread[0]
+        wanted = version if version is not None else (versions[-1] if versions else None)
+        if wanted is not None and wanted in digests:
+            return wanted, digests[wanted]
+        # A bundle of that name and version that cannot be served says more than that there is none.
+        for key, error in self.errors.items():
+            if key[0] == name and version in (key[1], None):
+                raise error
+        if not self.found:
+            raise_all(list(self.errors.values()))
+        if not versions:
+            known = ", ".join(sorted({n for n, _ in self.found})) or "none"
+            raise UnknownPolicyError(f"the repository has no policy '{name[:64]}': it has {known}")
+        raise UnknownVersionError(
+            f"the repository has no version '{str(version)[:32]}' of policy '{name}': it has {', '.join(versions)}"
+        )
 
 
 class Repository:
@@ -82,53 +129,19 @@ class Repository:
             bundles = BundleCache(Path(cache) if cache is not None else default_folder() / "bundles", cache_bytes)
             self._remote = [RemoteRepository(storage, bundles, limits) for storage in storages]
 
-    def available(self, *, needs_all: bool) -> dict[str, dict[str, str]]:
-        """Return every bundle's hash by name and version, for a first plan.
-
-        With `needs_all` all that is there has to be good: raises BundleError or UsageError, and UnavailableError where
-        a storage does not answer.
-        """
-        listing = self._look()
-        if listing.unread:
-            raise listing.unread[0]
-        if needs_all:
-            raise_all(list(listing.errors.values()))
-        hashes: dict[str, dict[str, str]] = {}
-        for (name, version), digest in sorted(listing.digests().items(), key=lambda each: version_key(each[0][1])):
-            hashes.setdefault(name, {})[version] = digest
-        return hashes
-
-    def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
-        """Return the hash of every bundle that can be served now, and a sentence for each thing that is wrong."""
-        listing = self._look()
-        return listing.digests(), [*listing.errors.values(), *listing.unread]
-
-    def find_digest(self, name: str, version: str | None) -> tuple[str, str]:
-        """Return (version, hash) of a bundle; None is the newest one.
-
-        Raises UnknownPolicyError or UnknownVersionError, what is wrong with the bundle of that name and version, and
-        UnavailableError if a storage that does not answer may have it.
-        """
-        listing = self._look()
-        digests = {v: digest for (n, v), digest in listing.digests().items() if n == name}
-        versions = sorted(digests, key=version_key)
-        if listing.unread and (version is None or version not in versions):
-            raise listing.unread[0]
-        wanted = version if version is not None else (versions[-1] if versions else None)
-        if wanted is not None and wanted in digests:
-            return wanted, digests[wanted]
-        # A bundle of that name and version that cannot be served says more than that there is none.
-        for key, error in listing.errors.items():
-            if key[0] == name and version in (key[1], None):
-                raise error
-        if not listing.found:
-            raise_all(list(listing.errors.values()))
-        if not versions:
-            known = ", ".join(sorted({n for n, _ in listing.found})) or "none"
-            raise UnknownPolicyError(f"the repository has no policy '{name[:64]}': it has {known}")
-        raise UnknownVersionError(
-            f"the repository has no version '{str(version)[:32]}' of policy '{name}': it has {', '.join(versions)}"
-        )
+    def look(self) -> Listing:
+        """Look through all places."""
+        listing = Listing()
+        self._look_in_folders(listing)
+        for remote in self._remote:
+            try:
+                for key, digest in remote.versions().items():
+                    listing.add(key, digest, f"{remote.uri}/{key[0]}/{key[1]}")
+            except UnavailableError as error:
+                listing.unread.append(error)
+            except BundleError as error:
+                listing.errors["", remote.uri] = error
+        return listing
 
     @contextlib.contextmanager
     def fetch(self, name: str, version: str, digest: str) -> Iterator[Path]:
@@ -164,7 +177,7 @@ class Repository:
             remote.cache.touch(digests)
 
     def _find_in_folders(self, name: str, version: str, digest: str, errors: list[RlservoError]) -> Path | None:
-        listing = _Listing()
+        listing = Listing()
         self._look_in_folders(listing)
         if (name, version) in listing.found and (name, version, digest) not in self._seen:
             errors.append(
@@ -183,21 +196,7 @@ class Repository:
         except BundleError:
             return False
 
-    def _look(self) -> _Listing:
-        """Look through all places."""
-        listing = _Listing()
-        self._look_in_folders(listing)
-        for remote in self._remote:
-            try:
-                for key, digest in remote.versions().items():
-                    listing.add(key, digest, f"{remote.uri}/{key[0]}/{key[1]}")
-            except UnavailableError as error:
-                listing.unread.append(error)
-            except BundleError as error:
-                listing.errors["", remote.uri] = error
-        return listing
-
-    def _look_in_folders(self, listing: _Listing) -> None:
+    def _look_in_folders(self, listing: Listing) -> None:
         """Add what the folders hold."""
         seen: dict[tuple[str, str, str], Path] = {}
         folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice counts once

@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import base64
-import contextlib
 import functools
-import http.client
 import os
-import socket
 import ssl
-import threading
 import time
-import urllib.request
 from collections.abc import Mapping
 from dataclasses import dataclass
-from http.client import HTTPMessage
 from typing import BinaryIO
-from urllib.parse import unquote, urlsplit
+
+import httpcore
 
 from rlservo.export.contract.errors import first_line
+from rlservo.serve_app.wire.bounded_http import FAILURES, MOST_HELD, DeadlineBackend, connection_pool
 
-BLOCK = 1 << 16  # [bytes]
 SLOWEST = 256 << 10  # [bytes/s] of a body, after the time-out
 REFUSAL = 4096  # [bytes] of a refusal's body, of which a sentence is made
-LOOPBACK = ("localhost", "127.", "::1")  # never through a proxy
 
 
 class TooLongReplyError(Exception):
@@ -35,7 +28,7 @@ class Reply:
     """Answer of a server; the body of a success is elsewhere."""
 
     status: int
-    headers: HTTPMessage
+    headers: Mapping[str, str]
     refusal: bytes = b""  # the beginning of its body
 
 
@@ -47,65 +40,37 @@ def request(
     Raises TooLongReplyError, ConnectionError, and TimeoutError when connecting takes longer than `timeout_s`, or the
     rest longer than that and the time of what has come at `SLOWEST`.
     """
-    connection, target, added = _connection(url, timeout_s)
-    ended, is_late = threading.Event(), threading.Event()
+    backend = DeadlineBackend()
+    backend.deadline = deadline = time.monotonic() + timeout_s + len(body) / SLOWEST
+    sent: dict[bytes | str, bytes | str] = {"Content-Length": str(len(body))} if method == "PUT" else {}
+    sent.update(headers)
+    timeout = {"connect": timeout_s, "read": timeout_s, "write": timeout_s}
+    blocks = (body[start : start + MOST_HELD] for start in range(0, len(body), MOST_HELD))
+    content = blocks if method == "PUT" else None
     length = 0
-
-    def watch(used: socket.socket) -> None:  # a socket's own time-out begins again with every byte
-        began = time.monotonic()
-        while (left_s := began + timeout_s + (len(body) + length) / SLOWEST - time.monotonic()) > 0:
-            if ended.wait(left_s):
-                return
-        is_late.set()
-        with contextlib.suppress(OSError):
-            used.shutdown(socket.SHUT_RDWR)
-
     try:
-        connection.connect()
-        threading.Thread(target=watch, args=[connection.sock], name="storage", daemon=True).start()
-        connection.request(method, target, body or None, {**added, **headers})
-        with connection.getresponse() as reply:
-            if not 200 <= reply.status < 300:
-                return Reply(reply.status, reply.headers, reply.read(REFUSAL))
-            while block := reply.read(BLOCK):
+        with (
+            connection_pool(url, backend, lambda: _trusted(os.environ.get("AWS_CA_BUNDLE") or None)) as pool,
+            pool.stream(method, url, headers=sent, content=content, extensions={"timeout": timeout}) as reply,
+        ):
+            found = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in reply.headers}
+            refusal = b""
+            for block in reply.iter_stream():
                 length += len(block)
-                if length > most:
+                backend.deadline = deadline + length / SLOWEST
+                if not 200 <= reply.status < 300:
+                    refusal += block[:REFUSAL]
+                    if length >= REFUSAL:
+                        break
+                elif length > most:
                     raise TooLongReplyError
-                into.write(block)
-            if is_late.is_set() or str(length) != reply.headers.get("content-length", str(length)):
-                raise ConnectionError(f"the connection broke after {length:,} bytes")
-            return Reply(reply.status, reply.headers)
-    except (OSError, http.client.HTTPException, ValueError) as error:
-        if is_late.is_set() or isinstance(error, TimeoutError):
-            raise TimeoutError from None
-        raise ConnectionError(first_line(error)) from None
-    finally:
-        ended.set()
-        connection.close()
-
-
-def _connection(url: str, timeout_s: float) -> tuple[http.client.HTTPConnection, str, dict[str, str]]:
-    """Return a connection to a URL's server, or to the environment's proxy for it, what to ask for, and headers."""
-    parts = urlsplit(url)
-    host, target = parts.hostname or "", parts._replace(scheme="", netloc="").geturl()
-    proxy = urllib.request.getproxies().get(parts.scheme)
-    if proxy is None or host.startswith(LOOPBACK) or urllib.request.proxy_bypass(host):
-        return _open(parts.scheme, host, parts.port, timeout_s), target, {}
-    via = urlsplit(proxy if "://" in proxy else f"http://{proxy}")
-    login = base64.b64encode(f"{unquote(via.username or '')}:{unquote(via.password or '')}".encode()).decode()
-    added = {"Proxy-Authorization": f"Basic {login}"} if via.username else {}
-    connection = _open(parts.scheme, via.hostname or "", via.port or 80, timeout_s)
-    if parts.scheme == "http":
-        return connection, url, added
-    connection.set_tunnel(host, parts.port or 443, added)
-    return connection, target, {}
-
-
-def _open(scheme: str, host: str, port: int | None, timeout_s: float) -> http.client.HTTPConnection:
-    if scheme == "http":
-        return http.client.HTTPConnection(host, port, timeout=timeout_s)
-    trusted = _trusted(os.environ.get("AWS_CA_BUNDLE") or None)
-    return http.client.HTTPSConnection(host, port, timeout=timeout_s, context=trusted)
+                else:
+                    into.write(block)
+            return Reply(reply.status, found, refusal)
+    except httpcore.TimeoutException:
+        raise TimeoutError from None
+    except FAILURES as error:
+        raise ConnectionError(f"the connection broke after {length:,} bytes" if length else first_line(error)) from None
 
 
 @functools.cache

@@ -44,7 +44,8 @@ class OfflineCommands:
 
     async def _listing(self) -> dict[str, Any]:
         plan = await PlanWriter(self._loader, self._files).newest()
-        digests, errors = await self._loader.look()
+        listing = await self._loader.look()
+        digests, errors = listing.digests, listing.wrong
         if plan is None and not digests:
             raise_all(errors)
         policies = {} if plan is None else plan.policies

@@ -11,7 +11,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from rlservo.export.contract.contract import version_key
-from rlservo.export.contract.errors import ConflictError, RlservoError, UnknownPolicyError, UnknownVersionError
+from rlservo.export.contract.errors import (
+    ConflictError,
+    RequestError,
+    RlservoError,
+    UnknownPolicyError,
+    UnknownVersionError,
+)
 from rlservo.serve_app.versions.serving_plan import PRODUCTION, Canary, Plan, PolicyConfig, PolicyPlan, ServedConfig
 
 LONGEST_HISTORY = 16  # earlier versions of an alias that a rollback can go back through
@@ -162,14 +168,17 @@ def _not_as_expected(policy: PolicyPlan, name: str, alias: str, expected: str) -
     )
 
 
-def set_canary(plan: Plan, name: str, canary: Canary | None) -> dict[str, PolicyPlan]:
-    """Send a share of the sessions to another version, or with None end that."""
+def set_canary(plan: Plan, name: str, version: str | None, share: float | None = None) -> dict[str, PolicyPlan]:
+    """Send a share of the sessions to another version, or with None or no share end that. Raises RequestError."""
+    if version is not None and share is None:
+        raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
+    canary = None if version is None or not share else Canary(version=version, share=share)
     return _with(plan, name, plan.policy(name), canary=canary)
 
 
-def set_shadow(plan: Plan, name: str, shadow: str | None) -> dict[str, PolicyPlan]:
+def set_shadow(plan: Plan, name: str, version: str | None) -> dict[str, PolicyPlan]:
     """Let another version compute along, or with None end that."""
-    return _with(plan, name, plan.policy(name), shadow=shadow)
+    return _with(plan, name, plan.policy(name), shadow=version)
 
 
 def _with(plan: Plan, name: str, policy: PolicyPlan, **changes: Any) -> dict[str, PolicyPlan]:

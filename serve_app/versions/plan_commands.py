@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from rlservo.export.contract.contract import first_fault
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan_writer import Change
@@ -30,19 +32,18 @@ class Command(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     summary: ClassVar[str]
-    version: Any = None
+    apply: ClassVar[Callable[..., dict[str, PolicyPlan]]]
+    """What it does to a plan, given the policy's name and the fields."""
+
+    version: Any = Field(None, exclude=True)  # of a command that takes none
 
     def words(self) -> str:
         """Return what follows the command and the policy's name."""
         return str(self.version or "")
 
-    def change(self, name: str) -> Change:
-        """Return what it does to a plan. Raises RequestError."""
-        raise NotImplementedError
-
     async def give(self, control: Control, name: str, what: str) -> Plan:
         """Carry it out; return the plan with it. Raises what the control raises."""
-        return await control.change(self.change(name), what=what)
+        return await control.change(partial(type(self).apply, name=name, **self.model_dump()), what=what)
 
 
 class Load(Command):
@@ -58,14 +59,13 @@ class Load(Command):
 
 class Unload(Command):
     summary = "Drop a version, or the policy"
+    apply = plan_changes.unload
     version: Version | None = Field(default=None, description="The whole policy when left out.")
-
-    def change(self, name: str) -> Change:
-        return partial(plan_changes.unload, name=name, version=self.version)
 
 
 class SetAlias(Command):
     summary = "Let an alias lead to a loaded version"
+    apply = plan_changes.set_alias
     alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
     version: Version | None = Field(description="A loaded version; null removes the alias.")
     expected: Version | None = Field(None, description="Where the alias leads now; when it does not, nothing changes.")
@@ -73,13 +73,10 @@ class SetAlias(Command):
     def words(self) -> str:
         return f"{self.alias}={self.version or ''}"
 
-    def change(self, name: str) -> Change:
-        alias, version, expected = self.alias, self.version, self.expected
-        return partial(plan_changes.set_alias, name=name, alias=alias, version=version, expected=expected)
-
 
 class Rollback(Command):
     summary = "Let an alias lead where it led before"
+    apply = plan_changes.roll_back
     alias: Alias = Field(PRODUCTION, description="The alias; `production` when left out.")
     expected: Version | None = Field(
         None, description="Where the alias leads now; when it does not, nothing changes. Makes a repeated command safe."
@@ -88,35 +85,24 @@ class Rollback(Command):
     def words(self) -> str:
         return self.alias
 
-    def change(self, name: str) -> Change:
-        return partial(plan_changes.roll_back, name=name, alias=self.alias, expected=self.expected)
-
 
 class SetCanary(Command):
     summary = "Send a share of the sessions to another version"
+    apply = plan_changes.set_canary
     version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
     share: float | None = Field(None, ge=0, le=1, description="Of the sessions; 0 ends the canary.")
 
     def words(self) -> str:
         return f"{self.version or 'off'} {self.share or ''}".strip()
 
-    def change(self, name: str) -> Change:
-        if self.version is not None and self.share is None:
-            raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
-        ended = self.version is None or not self.share
-        canary = None if ended else Canary(version=str(self.version), share=self.share or 0)
-        return partial(plan_changes.set_canary, name=name, canary=canary)
-
 
 class SetShadow(Command):
     summary = "Let another version compute along"
+    apply = plan_changes.set_shadow
     version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
 
     def words(self) -> str:
         return self.version or "off"
-
-    def change(self, name: str) -> Change:
-        return partial(plan_changes.set_shadow, name=name, shadow=self.version)
 
 
 COMMANDS: dict[str, type[Command]] = {
@@ -160,6 +146,4 @@ def parse(command: str, document: dict[str, Any]) -> Command:
     try:
         return COMMANDS[command].model_validate(document)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise RequestError(f"{command}: {where}: {first['msg']} (given: {first['input']!r:.80})") from None
+        raise RequestError(f"{command}: {first_fault(error, shows_input=True)}") from None

@@ -19,6 +19,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from rlservo.export.contract.bundle import CONTRACT_FILE
+from rlservo.export.contract.contract import first_fault
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.export.contract.regular_files import blocks, open_regular
 from rlservo.serve_app.repository.bundle_cache import default_folder
@@ -158,11 +159,8 @@ class PlanFiles:
         except FileNotFoundError:
             return None
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(map(str, first["loc"]))
-            raise UnavailableError(
-                f"{self._storage.uri}/{name} is not a plan that this rlservo can read: {where}: {first['msg']}"
-            ) from None
+            place = f"{self._storage.uri}/{name}"
+            raise UnavailableError(f"{place} is not a plan that this rlservo can read: {first_fault(error)}") from None
         self._remember(content)
         return plan
 

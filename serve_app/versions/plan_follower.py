@@ -74,8 +74,7 @@ class PlanFollower:
         Raises UsageError, BundleError and UnavailableError.
         """
         self._config = ServedConfig.parse(document)
-        held: list[Policy] = []
-        plan = await self._writer.at_start(self._config, held)
+        plan = await self._writer.at_start(self._config)
         if document and not plan_changes.agrees(plan, self._config):
             logger.warning(
                 "plan %d in %s (%s) differs from the configuration and is used: `rlservo policy` changes it",
@@ -84,16 +83,15 @@ class PlanFollower:
                 plan.changed_by,
             )
         await self._apply(plan)
+        self._loader.proven = ()
 
     async def load(self, name: str, version: str | None, *, what: str) -> Plan:
         """Add a version of the repository (None: the newest) as `PlanWriter.load` does, and follow."""
-        held: list[Policy] = []
-        return await self._carry_out(self._writer.load(name, version, what=what, known=self._generation(), held=held))
+        return await self._carry_out(self._writer.load(name, version, what=what, known=self._generation()))
 
     async def change(self, change: Change, *, what: str) -> Plan:
         """Make a change as `PlanWriter.change` does; return the plan when this process serves it."""
-        held: list[Policy] = []
-        return await self._carry_out(self._writer.change(change, what=what, known=self._generation(), held=held))
+        return await self._carry_out(self._writer.change(change, what=what, known=self._generation()))
 
     async def _carry_out(self, writing: Awaitable[Plan]) -> Plan:
         self._refused = {}
@@ -106,6 +104,7 @@ class PlanFollower:
             raise
         self._try_again()
         await self._apply(plan)
+        self._loader.proven = ()  # the store holds what of it is served
         return plan
 
     def _generation(self) -> int:
@@ -136,8 +135,8 @@ class PlanFollower:
 
     async def _tell_newer(self) -> None:
         with contextlib.suppress(UnavailableError):
-            digests, _ = await self._loader.look()
-            newer = ", ".join(" ".join(key) for key in self._newer(digests)[:10])
+            listing = await self._loader.look()
+            newer = ", ".join(" ".join(key) for key in self._newer(listing.digests)[:10])
             if newer:
                 number = self._generation()
                 logger.warning(
@@ -166,8 +165,8 @@ class PlanFollower:
         while True:
             await asyncio.sleep(period_s)
             try:
-                digests, errors = await self._loader.look()
-                wrong = {error.message for error in errors}
+                listing = await self._loader.look()
+                digests, wrong = listing.digests, {error.message for error in listing.wrong}
                 for name, version in self._newer(digests):
                     key = (name, version, digests[name, version])
                     if time.monotonic() < refused_until.get(key, 0.0):

@@ -15,7 +15,6 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.plan_files import PlanFiles
@@ -47,7 +46,7 @@ class PlanWriter:
         """Return the newest plan that has followed one; None where none has. Raises UnavailableError."""
         return await self._run(lambda: self._files.after(number), "reading")
 
-    async def at_start(self, config: ServedConfig, held: list[Policy]) -> Plan:
+    async def at_start(self, config: ServedConfig) -> Plan:
         """Return the newest plan; if there is none, write the one that a configuration means, as `change` does.
 
         Where object storage is unreachable, the plan that this machine saw last will do. Raises UsageError,
@@ -63,7 +62,7 @@ class PlanWriter:
         while plan is None:
             first = await self._unwritten(config)
             try:
-                held += await self._loader.prove(first.policies, {})
+                await self._loader.prove(first.policies, {})
             except RefusedError as error:  # nothing is served that could continue
                 raise BundleError(error.message, error.details) from None
             plan = first.after(first.policies, "configuration")
@@ -77,22 +76,20 @@ class PlanWriter:
                 ) from None
         return plan
 
-    async def load(
-        self, name: str, version: str | None, *, what: str, known: int = 0, held: list[Policy] | None = None
-    ) -> Plan:
+    async def load(self, name: str, version: str | None, *, what: str, known: int = 0) -> Plan:
         """Find a version in the repository (None: the newest), and add it as `change` does.
 
-        Raises what `Repository.find_digest` and `change` raise.
+        Raises what `Listing.find` and `change` raise.
         """
         try:
-            found, digest = await self._loader.find_digest(name, version)
+            found, digest = (await self._loader.look()).find(name, version)
         except REFUSALS as error:
             raise _refused(error) from None
         add = partial(plan_changes.load, name=name, version=found, digest=digest)
-        return await self.change(add, what=what, known=known, held=held)
+        return await self.change(add, what=what, known=known)
 
-    async def change(self, change: Change, *, what: str, known: int = 0, held: list[Policy] | None = None) -> Plan:
-        """Make a change; return the plan with it, and add to `held` the policies that were loaded to prove it.
+    async def change(self, change: Change, *, what: str, known: int = 0) -> Plan:
+        """Make a change; return the plan with it.
 
         `change` must not block. `what` is kept as who did what; `known` is the number of a plan that there must be.
         Nothing has changed when this raises: what `change` raises, RefusedError when a version cannot be served,
@@ -109,13 +106,11 @@ class PlanWriter:
             if policies == before.policies and before.generation:
                 return before
             try:
-                proven = await self._loader.prove(policies, before.policies if before.generation else {})
+                await self._loader.prove(policies, before.policies if before.generation else {})
             except REFUSALS as error:
                 raise _refused(error) from None
             plan = before.after(policies, what)
             if await self._create(plan):
-                if held is not None:
-                    held += proven
                 return plan
             first = await self.newest()
             if first is None:
@@ -133,7 +128,8 @@ class PlanWriter:
         raise UnavailableError("others keep changing what is served: try again")
 
     async def _unwritten(self, config: ServedConfig) -> Plan:
-        policies = plan_changes.plan_of(config, await self._loader.available(config), None)
+        available = (await self._loader.look()).available(needs_all=config.wants_all)
+        policies = plan_changes.plan_of(config, available, None)
         return Plan(generation=0, policies=policies, changed_at=now(), changed_by="configuration")
 
     async def _create(self, plan: Plan) -> bool:

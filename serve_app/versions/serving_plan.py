@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, version_key
+from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault, version_key
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
 
 PRODUCTION = "production"
@@ -84,11 +84,8 @@ class ServedConfig(_Model):
         try:
             return cls.model_validate(document or {})
         except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            where = ".".join(str(part) for part in first["loc"]) or "the document"
-            raise UsageError(
-                f"the policies' configuration is not usable: {where}: {first['msg']} (given: {first['input']!r:.80})"
-            ) from None
+            fault = first_fault(error, shows_input=True)
+            raise UsageError(f"the policies' configuration is not usable: {fault}") from None
 
 
 class PolicyPlan(_Model):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import weakref
-from collections.abc import Callable, Collection, Mapping
-from functools import partial
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,10 +18,10 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.repository.remote_repository import Key
-from rlservo.serve_app.repository.repository import TIMEOUT_S, Repository, raise_all
+from rlservo.serve_app.repository.repository import TIMEOUT_S, Listing, Repository, raise_all
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.serving_plan import PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.serving_plan import PolicyPlan
 
 Loadable = tuple[str, str, str]  # (name, version, hash)
 Result = TypeVar("Result")
@@ -46,6 +45,8 @@ class VersionLoader:
         self._load_bundle = load
         self._timeout_s = timeout_s
         self._calls = BlockingCalls()
+        self.proven: Sequence[Policy] = ()
+        """Loaded for the last proof, and in memory until the caller or the next proof replaces them."""
         self._loaded: weakref.WeakValueDictionary[Loadable, Policy] = weakref.WeakValueDictionary()
         self._tasks: dict[Loadable, asyncio.Task[Policy]] = {}
 
@@ -58,17 +59,9 @@ class VersionLoader:
         """Return the policy if the bundle with that hash is in memory."""
         return self._loaded.get((name, version, digest))
 
-    async def available(self, config: ServedConfig) -> dict[str, dict[str, str]]:
-        """Return every bundle's hash by name and version, as `Repository.available`. Also raises UnavailableError."""
-        return await self._look(partial(self._repository.available, needs_all=config.wants_all))
-
-    async def look(self) -> tuple[dict[Key, str], list[RlservoError]]:
-        """Return what the repository holds now and what is wrong with it, as `Repository.look`."""
+    async def look(self) -> Listing:
+        """Return what the repository holds now. Raises UnavailableError when that takes too long."""
         return await self._look(self._repository.look)
-
-    async def find_digest(self, name: str, version: str | None) -> tuple[str, str]:
-        """Return (version, hash) of a bundle, as `Repository.find_digest`."""
-        return await self._look(self._repository.find_digest, name, version)
 
     async def touch(self, digests: Collection[str]) -> None:
         """Keep what is served in the cache, as `Repository.touch`."""
@@ -99,11 +92,11 @@ class VersionLoader:
         self._tasks.pop(key, None)
         return task.result()
 
-    async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> list[Policy]:
+    async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
         """Load what is new or newly relied on in `policies`, and check that canary and shadow fit the default version.
 
-        Return what was loaded, which stays in memory for as long as the caller holds it. Raises RefusedError with all
-        that cannot be served, and UnavailableError if it only could not be read, or not in time.
+        Raises RefusedError with all that cannot be served, and UnavailableError if it only could not be read, or not in
+        time.
         """
         held: list[Policy] = []
         failures: list[tuple[Key, RlservoError]] = []
@@ -129,7 +122,7 @@ class VersionLoader:
                 raise UnavailableError(error.message, details) from None
             except RlservoError as error:
                 raise RefusedError(error.message, details) from None
-        return held
+        self.proven = held
 
     async def _look(self, function: Callable[..., Result], *arguments: Any) -> Result:
         what = "looking through the policies' folders"

@@ -192,7 +192,7 @@ def test_it_stops_when_another_operator_moves_the_alias(server: Server, tmp_path
         with server.admin() as admin:
             admin.alias("ur5", "production", "3")
         code, said = outcome_of(process)
-    assert code == 4 and "'production' leads to 3 and no longer to 1" in said, said
+    assert code == 4 and "production is 3 and no longer 1" in said, said
     assert server.serves("3", None)
 
 

@@ -298,7 +298,7 @@ def test_a_bundle_that_is_another_one_while_it_is_read_is_not_served_under_the_a
         return Policy.load(folder.with_name("1"))
 
     repository = Repository([root])
-    version, digest = repository.find_digest("ur5", "2")
+    version, digest = repository.look().find("ur5", "2")
     with pytest.raises(BundleTamperedError, match="is not the bundle that was accepted"):
         asyncio.run(VersionLoader(repository, other).load("ur5", version, digest))
 

@@ -36,7 +36,7 @@ def test_bundle_that_has_moved_since_the_look_is_found(discrete_policy: Callable
     discrete_policy(here, name="grid")
     discrete_policy(there, name="other")
     places = repository.Repository([here, there])
-    digest = places.available(needs_all=True)["grid"]["1"]
+    digest = places.look().available(needs_all=True)["grid"]["1"]
     (here / "grid").rename(there / "grid")
     with places.fetch("grid", "1", digest) as folder:
         assert folder == there / "grid" / "1"

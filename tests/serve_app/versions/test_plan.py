@@ -9,7 +9,7 @@ import pytest
 from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
 from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan_changes import plan_of
-from rlservo.serve_app.versions.serving_plan import Canary, Plan, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig
 
 AVAILABLE = {"ur5": {"1": "a", "2": "b", "10": "c"}, "mir": {"1": "d"}}
 
@@ -176,7 +176,7 @@ def test_what_is_in_use_is_not_unloaded() -> None:
         plan_changes.set_alias(now, "ur5", "old", None)
     assert {name for name, policy in plan_changes.unload(now, "mir", None).items() if policy.versions} == {"ur5"}
     with pytest.raises(UnknownVersionError, match="no version '3'"):
-        plan_changes.set_canary(now, "ur5", Canary(version="3", share=0.5))
+        plan_changes.set_canary(now, "ur5", "3", 0.5)
 
 
 def test_a_plan_agrees_with_its_configuration_until_a_command_changes_what_that_says() -> None:

@@ -28,7 +28,7 @@ from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.plan_files import FOLDER, PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.plan_writer import Change, PlanWriter
-from rlservo.serve_app.versions.serving_plan import Canary, Plan
+from rlservo.serve_app.versions.serving_plan import Plan
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
 OBS = np.zeros(27, np.float32) + 0.1
@@ -341,9 +341,7 @@ def test_canary_and_shadow_have_to_read_and_give_the_same(
         await fleet.deploy(config("1", "12", production="1"))
         control = fleet.controls[0]
         with pytest.raises(RefusedError, match=r"version 12 cannot be the canary of version 1"):
-            await control.change(
-                lambda p: plan_changes.set_canary(p, "ur5", Canary(version="12", share=0.5)), what="canary"
-            )
+            await control.change(lambda p: plan_changes.set_canary(p, "ur5", "12", 0.5), what="canary")
         with pytest.raises(RefusedError, match=r"version 12 cannot be the shadow of version 1"):
             await control.change(lambda p: plan_changes.set_shadow(p, "ur5", "12"), what="shadow")
         assert fleet.numbers() == {1}
@@ -403,7 +401,7 @@ def test_names_and_versions_do_not_leave_the_repository(folder: Path, tmp_path: 
     repository = Repository([folder])
     for name, version in (("../secret", "1"), ("ur5", "../../secret/1"), ("..", None), ("", None), ("ur5/1", None)):
         with pytest.raises(Exception, match="the repository has no"):
-            repository.find_digest(name, version)
+            repository.look().find(name, version)
 
 
 def test_nothing_changes_before_the_policies_are_loaded(folder: Path) -> None:

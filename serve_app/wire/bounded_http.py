@@ -1,7 +1,7 @@
-"""Network backend for httpcore that keeps one deadline over all reads and writes of a connection.
+"""Bounded HTTP connections: one deadline over all reads and writes, through the environment's proxy.
 
 httpcore's time-outs are for each read: a server that sends a byte now and then is waited for without end. A control
-loop's deadline is for the whole answer.
+loop's deadline, and that of a call to a storage, is for the whole answer.
 """
 
 from __future__ import annotations
@@ -10,11 +10,29 @@ import contextlib
 import ssl
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
+from urllib.parse import unquote, urlsplit
+from urllib.request import getproxies, proxy_bypass
 
 import httpcore
 
+from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.wire.addresses import host_of, is_loopback
+
+PROXIES: dict[str, Callable[..., httpcore.ConnectionPool]] = {
+    "http": httpcore.HTTPProxy,
+    "https": httpcore.HTTPProxy,
+    "socks5": httpcore.SOCKSProxy,
+    "socks5h": httpcore.SOCKSProxy,
+}
+FAILURES = (
+    httpcore.NetworkError,
+    httpcore.ProtocolError,
+    httpcore.ProxyError,
+    httpcore.TimeoutException,
+    httpcore.UnsupportedProtocol,
+)
 MOST_HELD = 65536
 """[bytes] Part of a request that is held back until it is complete."""
 
@@ -62,6 +80,32 @@ class DeadlineBackend(httpcore.NetworkBackend):
     def sleep(self, seconds: float) -> None:
         """Sleep, as httpcore's own retries do."""
         time.sleep(seconds)
+
+
+def connection_pool(
+    url: str, backend: DeadlineBackend, certificates: Callable[[], ssl.SSLContext], **options: Any
+) -> httpcore.ConnectionPool:
+    """Return the connections to a server, through the environment's proxy unless it is on this machine.
+
+    Raises UsageError for a proxy of another kind.
+    """
+    server = urlsplit(url)
+    options["network_backend"] = backend
+    # Reading the certificates takes 20 ms; http has no use for them.
+    options["ssl_context"] = certificates() if server.scheme == "https" else None
+    is_direct = is_loopback(server.hostname or "") or proxy_bypass(server.netloc)
+    proxy = None if is_direct else getproxies().get(server.scheme)
+    if proxy is None:
+        return httpcore.ConnectionPool(**options)
+    parts = urlsplit(proxy if "://" in proxy else f"http://{proxy}")
+    user = None if parts.username is None else (unquote(parts.username), unquote(parts.password or ""))
+    address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
+    if parts.scheme not in PROXIES:
+        raise UsageError(
+            f"a proxy in the environment variables begins with {parts.scheme!r}: expected an address such as "
+            "'http://proxy:3128'"
+        )
+    return PROXIES[parts.scheme](address, user, **options)
 
 
 class _DeadlineStream(httpcore.NetworkStream):
