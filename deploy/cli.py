@@ -29,6 +29,7 @@ from rlservo.deploy.commands.publish import publish
 from rlservo.deploy.commands.replay import estimate, replay
 from rlservo.deploy.commands.robot_server import robot_latency, robot_server, server_manager, ur_controller
 from rlservo.deploy.commands.rollout import rollout
+from rlservo.deploy.commands.ros2 import ros2, ros2_sim
 from rlservo.deploy.commands.serve import serve
 from rlservo.deploy.commands.verify import verify
 from rlservo.export.contract.errors import RlservoError, UsageError
@@ -87,10 +88,13 @@ for command in (
     server_manager,
     ur_controller,
     robot_latency,
+    ros2_sim,
     replay,
     estimate,
 ):
     app.command()(command)
+# ROS's own arguments are nobody's options here: --ros-args and what follows.
+app.command(context_settings={"ignore_unknown_options": True})(ros2)
 policy.command()(promote)
 app.add_typer(robot_server, name="robot-server")
 app.add_typer(policy, name="policy")

@@ -17,6 +17,8 @@ ENTRY_POINTS = {
     "NoObstacleNavigationMir100Sim-v0": "rlservo.envs.mir100.no_obstacle_navigation:NoObstacleNavigationMir100Sim",
     "SparseFixNavigationMir100Sim-v0": "rlservo.envs.mir100.sparse_fix_navigation:SparseFixNavigationMir100Sim",
     "ObstacleAvoidanceMir100Sim-v0": "rlservo.envs.mir100.obstacle_avoidance:ObstacleAvoidanceMir100Sim",
+    "NoObstacleNavigationMir100Rob-v0": "rlservo.envs.mir100.real:NoObstacleNavigationMir100Rob",
+    "ObstacleAvoidanceMir100Rob-v0": "rlservo.envs.mir100.real:ObstacleAvoidanceMir100Rob",
     "Randomized-v0": "rlservo.envs.randomization:make_randomized",
 }
 

@@ -93,7 +93,11 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "httpcore": (
         "serve_app/client/http_transport.py", "serve_app/repository/storage_http.py", "serve_app/wire/bounded_http.py",
     ),
-    "websockets": ("deploy/cockpit/page.py", "serve_app/client/websocket_connection.py"),
+    "websockets": (
+        "deploy/cockpit/page.py", "envs/ros2/rosbridge_server.py", "serve_app/client/websocket_connection.py",
+    ),
+    "rclpy": ("envs/ros2/rclpy_link.py",),
+    "roslibpy": ("envs/ros2/rosbridge_link.py",),
     "viser": ("deploy/cockpit/",),
     "trimesh": ("deploy/cockpit/meshes.py", "deploy/cockpit/scenery.py"),
     "pickle": ("export/checkpoints/unpickle.py",),

@@ -82,7 +82,7 @@ def rollout(
         raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
     arguments = parse_env_arguments(env_arg or []) | ({"confirm": False} if yes else {})
     if "robot" in arguments:
-        require("ur", "rtde_control", what="a real robot")
+        _require_robot(str(arguments["robot"]))
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     if video is not None:
         choose_gl_backend()
@@ -94,10 +94,10 @@ def rollout(
 
     with (
         terminal.status(f"0 of {episodes} episodes") as show,
-        _acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting,
+        acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting,
     ):
         report = run_rollout(
-            _with_fallback(acting, fallback),
+            with_fallback(acting, fallback),
             env,
             episodes=episodes,
             seed=seed,
@@ -120,7 +120,15 @@ def rollout(
         raise typer.Exit(1)
 
 
-def _acting_policy(
+def _require_robot(robot: str) -> None:
+    """Raise UsageError where the package that reaches a robot is not installed."""
+    if robot.startswith("rosbridge://"):
+        require("rosbridge", "roslibpy", what="a rosbridge")
+    elif not robot.startswith("ros2:"):  # which names its own lack: ROS 2 is no package of PyPI's
+        require("ur", "rtde_control", what="a real robot")
+
+
+def acting_policy(
     url: str | None,
     name: str | None,
     bundle: Path | None,
@@ -142,7 +150,8 @@ def _acting_policy(
     return kind(str(url), name, deadline_ms=deadline_ms, server_state=server_state, api_key=api_key)
 
 
-def _with_fallback(policy: ActingPolicy, fallback: str | None) -> ActingPolicy:
+def with_fallback(policy: ActingPolicy, fallback: str | None) -> ActingPolicy:
+    """Return the policy with what a late action becomes. Raises UsageError."""
     if fallback is None:
         return policy
     from rlservo.serve_app.rollout.fallback import WithFallback

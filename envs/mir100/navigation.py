@@ -29,6 +29,7 @@ from rlservo.envs.mir100.sensor_errors import sensor_errors
 from rlservo.envs.mir100.simulation import Mir100Simulation, wrap_angle
 from rlservo.envs.mir100.worlds import Pose
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv, Start
+from rlservo.envs.robots.arm import MUJOCO
 
 LINEAR_SCALE, ANGULAR_SCALE = 0.5, 0.7  # [m/s], [rad/s], of an action of 1
 SUCCESS_DISTANCE = 0.2  # [m]
@@ -68,11 +69,15 @@ class Mir100Navigation(RenderedEnv):
         failure_reward: float = FAILURE_REWARD,
         step_reward: float = 0.0,
         render_mode: str | None = None,
+        robot: str = MUJOCO,
+        limits: Mapping[str, Any] | None = None,
+        confirm: bool = True,
     ) -> None:
         del ip, lower_bound_port, upper_bound_port, rs_address  # no robot server to reach
         del rs_state_to_info  # robo-gym's MiR100 environments accept it and put nothing into info either
         super().__init__(render_mode, gui=gui)
-        self.simulation = Mir100Simulation(self.WORLD, laser_noise=laser_noise)
+        self.is_real = robot != MUJOCO
+        self.simulation = self._build(robot, laser_noise, limits, confirm)
         self._elements = self.describe()["action"]
         for name, value in (("failure_reward", failure_reward), ("step_reward", step_reward)):
             if not math.isfinite(value):
@@ -148,7 +153,7 @@ class Mir100Navigation(RenderedEnv):
             reward += PROGRESS_REWARD * (self._previous_distance - distance)
         self._previous_distance = distance
 
-        status = self._failure()
+        status = self._failure() or self.simulation.stopped_by
         if status is not None:
             reward = self._failure_reward
         if distance < SUCCESS_DISTANCE:  # in robo-gym's order: arriving outweighs a failure in the same step
@@ -157,11 +162,28 @@ class Mir100Navigation(RenderedEnv):
         truncated = not terminated and self._steps >= MAX_STEPS
         if truncated:
             status = "max_steps_exceeded"
-        info = {} if status is None else {"final_status": status, "is_success": status == "success"}
+        info: dict[str, Any] = {}
+        if status is not None:
+            info = {"final_status": status, "is_success": status == "success"}
+        if (robot := self.simulation.robot_info()) is not None:
+            info["robot"] = robot
         self._refresh_window()
         if any(self._base_offset):
             distance, bearing = self._told_target_polar()
         return self._observation(distance, bearing), reward, terminated, truncated, info
+
+    def close(self) -> None:
+        """Free the GL context, close the window, and stop a real base."""
+        self.simulation.close()
+        super().close()
+
+    def limited(self) -> dict[str, int] | None:
+        """Return in how many commands each limit of a real base was kept; None for a simulated one."""
+        return self.simulation.limited()
+
+    def take_over(self) -> None:
+        """Leave a real base to a person, or take it back. Raises ValueError for a simulated one."""
+        self.simulation.take_over()
 
     # -- for disturbances
 
@@ -254,6 +276,15 @@ class Mir100Navigation(RenderedEnv):
         """Return the final status if the robot has failed, else None."""
 
     # -- parts
+
+    def _build(
+        self, robot: str, laser_noise: float, limits: Mapping[str, Any] | None, confirm: bool
+    ) -> Mir100Simulation:
+        if robot == MUJOCO:
+            return Mir100Simulation(self.WORLD, laser_noise=laser_noise)
+        from rlservo.envs.ros2.mirrored_base import MirroredMir100
+
+        return MirroredMir100(robot, needs_scan=self.LASER_COUNT > 0, limits=limits or {}, confirm=confirm)
 
     def _random_target(self, start: Sequence[float]) -> Pose:
         while True:

@@ -81,6 +81,26 @@ class Mir100Simulation:
         )
         self.place((0.0, 0.0, 0.0))
 
+    # -- of a real base's mirror
+
+    stopped_by: str | None = None
+    """Why the base does not move any more, as an episode's final status; a simulated one is never stopped."""
+
+    def robot_info(self) -> dict[str, Any] | None:
+        """Return what a step's info holds of a real robot."""
+        return None
+
+    def limited(self) -> dict[str, int] | None:
+        """Return in how many commands each limit of a real base was kept."""
+        return None
+
+    def take_over(self) -> None:
+        """Leave the base to a person, or take it back. Raises ValueError: a simulated base cannot be taken over."""
+        raise ValueError("a simulated base cannot be taken over")
+
+    def close(self) -> None:
+        """Free what the base holds; a simulated one holds nothing."""
+
     # -- placing
 
     def place(
@@ -175,14 +195,14 @@ class Mir100Simulation:
         self._command_age = 0
         return is_accepted
 
-    def advance(self) -> None:
-        """Let one control cycle of 0.1 s pass. `in_collision` reports a contact at any moment of it."""
+    def advance(self, substeps: int = SUBSTEPS) -> None:
+        """Let one control cycle of 0.1 s pass, or `substeps` of 0.01 s. `in_collision` reports any contact in it."""
         model, data, step = self.model, self.data, mujoco.mj_step
         ctrl = data.ctrl
         linear, angular = self._setpoint
         linear_factor, angular_factor = self._velocity_factors
         in_contact = False
-        for _ in range(SUBSTEPS):
+        for _ in range(substeps):
             if self._command_age >= TIMEOUT_SUBSTEPS:
                 self._command = (0.0, 0.0)
             self._command_age += 1

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Vector = NDArray[np.float64]
 
-RTDE = "rtde://"
+RTDE, ROS2, ROSBRIDGE = "rtde://", "ros2:", "rosbridge://"
 MUJOCO = "mujoco"
 STOP_NAMES = {3: "protective_stop", 5: "safeguard_stop", 6: "emergency_stop", 7: "emergency_stop"}
 
@@ -47,10 +47,12 @@ class Arm(Protocol):
 
 
 def host_of(robot: str) -> str | None:
-    """Return the host of 'rtde://HOST', None of 'mujoco'. Raises RobotError for anything else."""
+    """Return the host of 'rtde://HOST', None of 'mujoco', 'ros2:...' as it is. Raises RobotError for anything else."""
     if robot == MUJOCO:
         return None
+    if robot.startswith(ROS2):
+        return robot
     host = robot.removeprefix(RTDE)
     if robot == host or not host or "/" in host or ":" in host:
-        raise RobotError(f"robot {robot!r}: expected '{MUJOCO}' or '{RTDE}HOST', '{RTDE}192.168.0.2' say")
+        raise RobotError(f"robot {robot!r}: expected '{MUJOCO}', '{RTDE}HOST' ('{RTDE}192.168.0.2' say) or '{ROS2}'")
     return host

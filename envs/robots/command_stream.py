@@ -17,12 +17,12 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.envs.robots.arm import STOP_NAMES, RobotError
+from rlservo.envs.robots.arm import ROS2, STOP_NAMES, RobotError
 from rlservo.envs.robots.limits import COUNTED, LATE, Limits, MotionLimiter
 from rlservo.envs.robots.shared_block import SharedBlock
 from rlservo.envs.ur.simulation import URSimulation
@@ -135,6 +135,10 @@ class _Connection:
             raise RobotError(f"the controller at {host} takes no program ({str(error).strip()}): {hint}") from error
         self.control.setWatchdog(settings.limits.watchdog_hz)  # from here on commands must follow at once
 
+    def age_s(self) -> float | None:
+        """Return None: how old the newest state was when it came is not known, for the robot's clock is its own."""
+        return None
+
     def _check_model(self, settings: StreamSettings, model: str, version: str) -> None:
         is_e_series = not version.startswith("3.")
         found = model.strip().lower() + ("e" if is_e_series else "")
@@ -160,10 +164,35 @@ class _Connection:
         self.receive.disconnect()
 
 
+class Connection(Protocol):
+    """A connection to the arm; `receive` and `control` have those methods of ur_rtde's that the loop calls."""
+
+    rate_hz: float
+    receive: Any
+    control: Any
+
+    def age_s(self) -> float | None:
+        """Return how old the newest state was when it came [s]; None where the clocks cannot be compared."""
+        ...
+
+    def close(self) -> None:
+        """End the program and disconnect."""
+        ...
+
+
+def connect(settings: StreamSettings) -> Connection:
+    """Return the connection that the address asks for. Raises RobotError."""
+    if settings.host.startswith(ROS2):
+        from rlservo.envs.ros2.arm import RosArmConnection
+
+        return RosArmConnection(settings)
+    return _Connection(settings)
+
+
 class CommandStream:
     """The loop. `run` returns when it is told to end or at a fault, whose sentence it raises as RobotError."""
 
-    def __init__(self, settings: StreamSettings, connection: _Connection, simulation: URSimulation) -> None:
+    def __init__(self, settings: StreamSettings, connection: Connection, simulation: URSimulation) -> None:
         self._settings, self._limits, self._robot = settings, settings.limits, connection
         self._orders = SharedBlock(settings.orders_descriptor, ORDERS)
         self._report = SharedBlock(settings.report_descriptor, REPORT)
@@ -211,7 +240,9 @@ class CommandStream:
             offset = now - robot_s
             creep = OFFSET_CREEP * (now - self._received_s)
             self._usual_offset_s = min(offset, self._usual_offset_s + creep)
-            self._robot_s, self._received_s, self._age_s = robot_s, now, offset - self._usual_offset_s
+            known_s = self._robot.age_s()
+            self._robot_s, self._received_s = robot_s, now
+            self._age_s = offset - self._usual_offset_s if known_s is None else known_s
 
     def _check(self) -> None:
         receive, now = self._robot.receive, time.monotonic()
@@ -322,7 +353,7 @@ def main(argv: list[str]) -> None:
     stream = None
     try:
         simulation = URSimulation(settings.ur_model, objects=())  # takes longer than the watchdog waits
-        connection = _Connection(settings)
+        connection = connect(settings)
         try:
             stream = CommandStream(settings, connection, simulation)
             signal.signal(signal.SIGTERM, lambda *_: stream.is_asked_to_end.set())

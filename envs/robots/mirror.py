@@ -76,6 +76,7 @@ class MirroredSimulation(URSimulation):
             except RobotError:
                 self._arm.close()
                 raise
+        self._mirror()
 
     # -- instead of the simulation's
 

@@ -3,8 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
-from rlservo.envs.ur_controller.server import ControllerServer
+from rlservo.envs.ur_controller.controller import Controller
+from rlservo.envs.ur_controller.server import Link
+
+
+class Simulated(Protocol):
+    """A controller and the link to it."""
+
+    @property
+    def controller(self) -> Controller: ...
+
+    @property
+    def link(self) -> Link: ...
+
 
 HELP = """\
 protective         protective stop          unlock         unlock it, as the dashboard does
@@ -15,7 +28,7 @@ drop 0.01          link: share of RTDE data packages lost
 down, up           link: cut and restored   state          where the arm is"""
 
 
-def obey(server: ControllerServer, line: str) -> str:
+def obey(server: Simulated, line: str) -> str:
     """Carry out a line and return what to print. Call it between two control cycles (`ControllerServer.do`)."""
     word, _, rest = line.strip().partition(" ")
     controller, link = server.controller, server.link
@@ -47,7 +60,7 @@ def obey(server: ControllerServer, line: str) -> str:
     return ""
 
 
-def _state(server: ControllerServer) -> str:
+def _state(server: Simulated) -> str:
     controller = server.controller
     positions = " ".join(f"{value:.3f}" for value in controller.simulation.joint_positions)
     speed = abs(controller.simulation.joint_velocities).max()

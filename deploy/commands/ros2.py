@@ -1,0 +1,170 @@
+"""The commands `rlservo ros2` and `rlservo ros2-sim`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from rlservo.deploy import terminal
+from rlservo.deploy.commands.environment_options import parse_env_arguments
+from rlservo.deploy.commands.rollout import TransportKind, acting_policy, with_fallback
+from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import needs_extra, require
+
+if TYPE_CHECKING:
+    from rlservo.envs.ros2.link import Link
+
+
+def ros2(
+    bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle.")] = None,
+    url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
+    policy: Annotated[str | None, typer.Option(help="Policy name on that server; its only one by default.")] = None,
+    robot: Annotated[
+        str, typer.Option(help="Address of an arm or base of ours: ros2:NAME=VALUE,... (topics, prefix, command).")
+    ] = "ros2:",
+    env_arg: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment argument: ur_model=ur5e, limits={...}.")
+    ] = None,
+    mapping: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="ROS 2 parameter file: where elements are in messages."),
+    ] = None,
+    name: Annotated[str, typer.Option(help="The node's name.")] = "rlservo",
+    rate: Annotated[
+        float | None, typer.Option(min=0.1, help="Mapped elements: control rate [Hz], instead of the contract's.")
+    ] = None,
+    max_age: Annotated[
+        float | None, typer.Option(min=0.01, help="Mapped elements: age [s] of an input that is not acted on.")
+    ] = None,
+    autostart: Annotated[bool, typer.Option("--autostart", help="Run without a call of the start service.")] = False,
+    transport: Annotated[TransportKind, typer.Option(help="With --url: http or ws.")] = "http",
+    deadline_ms: Annotated[float | None, typer.Option(help="With --url: deadline for each action.")] = None,
+    fallback: Annotated[
+        str | None, typer.Option(metavar="hold|zero|stop|ACTION", help="With --url: what a late action becomes.")
+    ] = None,
+    record: Annotated[Path | None, typer.Option(help="Record into a new .mcap file or a folder.")] = None,
+    unproven: Annotated[
+        bool, typer.Option("--unproven", help="Take a policy that was never evaluated under latency.")
+    ] = False,
+    ros_args: Annotated[
+        list[str] | None, typer.Argument(metavar="--ros-args ...", help="Remappings and parameters, as for any node.")
+    ] = None,
+) -> None:
+    """Be a ROS 2 node that drives a robot with a policy, until Ctrl-C.
+
+    A policy of one of our environments drives its robot to each pose on ~/target. Any other policy's observation and
+    action elements are fields of messages, by their names or by --mapping. Services: ~/start, ~/hold, ~/stop,
+    ~/version; heartbeat: /diagnostics.
+
+    Example: `rlservo ros2 --bundle policies/ur_positioning --env-arg ur_model=ur5e`
+    """
+    if (url is None) == (bundle is None):
+        raise UsageError("give either --url (a server) or --bundle (in process)")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    _pass_ros_arguments(ros_args or [], mapping)
+    with needs_extra("sim", "mujoco", "gymnasium"):
+        from rlservo.deploy.ros2.node import PolicyNode, drive_elements, drive_environment, real_environment
+        from rlservo.envs.robots.arm import RobotError
+    if record is not None:
+        require("record", "mcap", "orjson")
+    stop = threading.Event()
+    with ExitStack() as cleanup:
+        acting: Any = cleanup.enter_context(acting_policy(url, policy, bundle, transport, deadline_ms, False, None))
+        acting = with_fallback(acting, fallback)
+        if record is not None:
+            from rlservo.serve_app.recording.start import record_policy
+
+            acting = record_policy(acting, record)
+            cleanup.callback(acting.end)
+        try:
+            node = PolicyNode(acting, name, autostart=autostart)
+            cleanup.callback(node.close)
+            cleanup.enter_context(terminal.ctrl_c_sets(stop))
+            terminal.note(f"node /{name}: policy {acting.contract.name} {acting.contract.version}; Ctrl-C ends it")
+            ours = real_environment(acting.contract)
+            if ours is not None and not node.parameters():
+                arguments = ours[1] | parse_env_arguments(env_arg or []) | {"robot": robot, "confirm": False}
+                drive_environment(node, stop, ours[0], arguments, unproven=unproven)
+            else:
+                drive_elements(node, stop, rate_hz=rate, max_age_s=max_age)
+        except RobotError as error:
+            raise UsageError(str(error)) from error
+
+
+def ros2_sim(
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="mir100, or an arm: ur3e, ur5, ur5e, ur10e ...")],
+    controller: Annotated[
+        Literal["position", "velocity", "trajectory"], typer.Option(help="Arm: the controller that is active.")
+    ] = "position",
+    prefix: Annotated[str, typer.Option(help="Arm: before the joints' names.")] = "",
+    world: Annotated[str, typer.Option(help="Base: empty or lab_6x8.")] = "empty",
+    twist: Annotated[Literal["Twist", "TwistStamped"], typer.Option(help="Base: type of /cmd_vel.")] = "Twist",
+    rosbridge_port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Base: a rosbridge on this port of 127.0.0.1; 0: any free.")
+    ] = None,
+    ros: Annotated[bool, typer.Option("--ros/--no-ros", help="Base: join the ROS 2 graph.")] = True,
+) -> None:
+    """Be a simulated robot with a real one's topics, until Ctrl-C. Lines on standard input stop it or cut the link.
+
+    Example: `rlservo ros2-sim ur5e`, or without ROS `rlservo ros2-sim mir100 --no-ros --rosbridge-port 9090`
+    """
+    if robot == "mir100" and not ros and rosbridge_port is None:
+        raise UsageError("--no-ros needs --rosbridge-port: the robot would have no link at all")
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    with needs_extra("sim", "mujoco"):
+        from rlservo.envs.robots.arm import RobotError
+        from rlservo.envs.ros2.simulation_loop import SimulatedRobot, run
+        from rlservo.envs.ur_controller.server import Link as LinkFaults
+    where = []
+    stop = threading.Event()
+    simulated: SimulatedRobot
+    with ExitStack() as cleanup:
+        try:
+            if robot == "mir100":
+                from rlservo.envs.ros2.simulated_base import SimulatedBase
+
+                links: list[Link] = []
+                if ros:
+                    from rlservo.envs.ros2.rclpy_link import RclpyLink
+
+                    links.append(RclpyLink("mir100_sim", is_unique=True))
+                    where.append("ROS 2")
+                if rosbridge_port is not None:
+                    with needs_extra("client", "websockets"):
+                        from rlservo.envs.ros2.rosbridge_server import RosbridgeServer
+                    bridge = RosbridgeServer("127.0.0.1", rosbridge_port)
+                    links.append(bridge)
+                    where.append(f"rosbridge://127.0.0.1:{bridge.port}")
+                base = SimulatedBase(links, world=world, is_stamped=twist == "TwistStamped", faults=LinkFaults())
+                simulated = base
+                cleanup.callback(base.close)
+            else:
+                from rlservo.envs.ros2.simulated_arm import SimulatedArm
+
+                arm = SimulatedArm(robot, controller=controller, prefix=prefix, faults=LinkFaults())
+                simulated = arm
+                cleanup.callback(arm.close)
+                where.append(f"ROS 2, {controller} controller")
+        except (RobotError, ValueError) as error:
+            raise UsageError(str(error)) from error
+        cleanup.enter_context(terminal.ctrl_c_sets(stop))
+        run(
+            simulated,
+            stop,
+            lambda: terminal.show(f"{robot} on {' and '.join(where)}; help and Enter lists commands, Ctrl-C ends it"),
+        )
+
+
+def _pass_ros_arguments(words: list[str], mapping: Path | None) -> None:
+    """Give ROS's own arguments to this process' nodes and to those of the processes that it starts."""
+    rest = [word for word in words if word not in ("--ros-args", "--")]
+    if mapping is not None:
+        rest += ["--params-file", str(mapping.resolve())]
+    if rest:
+        os.environ["RLSERVO_ROS_ARGS"] = "\n".join(rest)

@@ -1,0 +1,234 @@
+"""The node around a policy: services, heartbeat, and the loop from messages to commands."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from rlservo.deploy.ros2.elements import ElementInputs, ElementOutputs, places
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.ros2.link import take_command
+from rlservo.envs.ros2.messages import DIAGNOSTICS, POSE_STAMPED, stamp
+from rlservo.envs.ros2.rclpy_link import RclpyLink
+from rlservo.envs.ur.parameters import JOINTS
+from rlservo.export.contract.contract import Contract
+from rlservo.export.contract.errors import RlservoError, UsageError
+from rlservo.serve_app.interface import ActingPolicy
+from rlservo.serve_app.rollout.environment import check_fit, check_proven, make_env
+
+HEARTBEAT_S = 0.5
+OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # DiagnosticStatus' levels
+# Environments of ours by the simulated one that a policy was trained in, and the frame of their target.
+REAL = {
+    "EndEffectorPositioningURSim-v0": ("EndEffectorPositioningURRob-v0", "ee_target_pose", "base_link"),
+    "NoObstacleNavigationMir100Sim-v0": ("NoObstacleNavigationMir100Rob-v0", "target_pose", "odom"),
+    "ObstacleAvoidanceMir100Sim-v0": ("ObstacleAvoidanceMir100Rob-v0", "target_pose", "odom"),
+}
+
+# Arguments of a policy's environment that say what its elements mean, and which robot it is for.
+MEANINGS = ("ur_model", "restrict_wrist_1", "action_cycle_rate", "max_velocity_scale_factor", *(
+    f"fix_{joint}" for joint in JOINTS
+))  # fmt: skip
+
+log = logging.getLogger("rlservo.ros2")
+
+
+def real_environment(contract: Contract) -> tuple[str, dict[str, Any]] | None:
+    """Return the simulated environment of ours that a policy was trained in and its arguments; None for others."""
+    config = contract.provenance.env_config
+    name = str(config.get("env_id") or contract.provenance.env_id).rpartition("/")[2]
+    return (name, {key: config[key] for key in MEANINGS if key in config}) if name in REAL else None
+
+
+class Wanted(str, Enum):
+    """What the services asked for last."""
+
+    RUN = "run"
+    HOLD = "hold"
+    STOP = "stop"
+
+
+class PolicyNode:
+    """A node `rlservo`; `run` drives until `stop` is set. Its services answer at once, the loop follows."""
+
+    def __init__(self, policy: ActingPolicy, name: str, *, autostart: bool) -> None:
+        """Join the graph. Raises RobotError without rclpy, or where a node of that name is there already."""
+        self.policy = policy
+        self.link = RclpyLink(name, is_unique=True)
+        self.state, self.why = "waiting", ""
+        self.counts: dict[str, int] = {"decisions": 0, "episodes": 0, "successes": 0, "held": 0, "late": 0}
+        self.wanted = Wanted.RUN if autostart else Wanted.STOP
+        self._diagnose = self.link.advertise("/diagnostics", DIAGNOSTICS)
+        self._is_closed = threading.Event()
+        for word in Wanted:
+            self.link.serve(f"~/{'start' if word is Wanted.RUN else word.value}", self._setter(word))
+        contract = policy.contract
+        self.link.serve("~/version", lambda: (True, f"{contract.name} {self.policy.contract.version}"))
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._thread.start()
+
+    def parameters(self) -> dict[str, str]:
+        """Return the parameters that map elements: `observation.NAME` and `action.NAME`."""
+        found: dict[str, str] = {}
+        for side in ("observation", "action"):
+            for name, parameter in self.link.node.get_parameters_by_prefix(side).items():
+                found[f"{side}.{name}"] = str(parameter.value)
+        return found
+
+    def enter(self, state: str, why: str = "") -> None:
+        """Change the state: one line in the log, and in the heartbeat."""
+        if (state, why) != (self.state, self.why):
+            if state != self.state or state == "holding":
+                log.info("node: %s -> %s%s", self.state, state, f": {why}" if why else "")
+            self.state, self.why = state, why
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._is_closed.set()
+        self._thread.join()
+        self.link.close()
+
+    def _setter(self, word: Wanted) -> Callable[[], tuple[bool, str]]:
+        def answer() -> tuple[bool, str]:
+            self.wanted = word
+            return True, f"{word.value} (was {self.state})"
+
+        return answer
+
+    def _beat(self) -> None:
+        while not self._is_closed.wait(HEARTBEAT_S):
+            contract = self.policy.contract
+            facts = {"state": self.state, "policy": contract.name, "version": contract.version, **self.counts}
+            level = {"fault": ERROR, "holding": WARN, "waiting": WARN}.get(self.state, OK)
+            status = {
+                "level": level,
+                "name": f"{self.link.node.get_fully_qualified_name()}: policy",
+                "message": f"{self.state}: {self.why}" if self.why else self.state,
+                "hardware_id": contract.name,
+                "values": [{"key": key, "value": str(value)} for key, value in facts.items()],
+            }
+            self._diagnose({"header": {"stamp": stamp(self.link.now_s())}, "status": [status]})
+
+
+def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | None, max_age_s: float | None) -> None:
+    """Drive a robot by the contract's element names until `stop` is set. Raises UsageError, RobotError."""
+    policy, contract = node.policy, node.policy.contract
+    rate_hz = rate_hz or contract.control_rate_hz
+    if rate_hz is None:
+        raise UsageError(f"policy {contract.name!r} states no control rate: give --rate")
+    observed, acted = places(contract, node.parameters())
+    inputs = ElementInputs(node.link, observed, max_age_s or max(0.1, 2.0 / rate_hz))
+    kinds = {place.topic: place.kind for place in acted}
+    outputs = ElementOutputs(acted, {topic: take_command(node.link, topic, kind) for topic, kind in kinds.items()})
+    due, was_running = time.monotonic(), False
+    while not stop.is_set():
+        due = max(due + 1.0 / rate_hz, time.monotonic())
+        observation, why = inputs.observe()
+        if node.wanted is not Wanted.RUN:
+            node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
+            was_running = was_running and node.wanted is Wanted.HOLD
+        elif observation is None:
+            node.enter("holding" if was_running else "waiting", why)
+            node.counts["held"] += was_running
+        else:
+            if not was_running:
+                policy.reset()
+                node.counts["episodes"] += 1
+            was_running = True
+            try:
+                outputs.act(np.asarray(policy.act(observation)))
+                node.enter("running")
+                node.counts["decisions"] += 1
+            except RlservoError as error:  # late, unreachable, refused: nothing is commanded in this cycle
+                node.enter("holding", error.message)
+                node.counts["late"] += 1
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+class _Target:
+    """The newest target."""
+
+    def __init__(self, frame: str) -> None:
+        self._frame = frame
+        self.pose: Any = None
+        self.number = 0
+
+    def take(self, message: Any) -> None:
+        frame = message.header.frame_id
+        if frame and frame != self._frame:
+            log.warning("a target in frame %r was ignored: expected %r", frame, self._frame)
+            return
+        self.pose = message.pose.position
+        self.number += 1
+
+
+def drive_environment(
+    node: PolicyNode, stop: threading.Event, trained_in: str, arguments: Mapping[str, Any], *, unproven: bool
+) -> None:
+    """Drive one of our robots to each target on `~/target` until `stop` is set. Raises UsageError, RobotError."""
+    real_id, option, frame = REAL[trained_in]
+    env = make_env(f"rlservo/{real_id}", arguments, render=False)
+    try:
+        check_fit(node.policy.contract, env, arguments)
+        if not unproven:
+            check_proven(node.policy.contract, env)
+        target = _Target(frame)
+        node.link.subscribe("~/target", POSE_STAMPED, target.take, is_kept=False)
+        done = 0
+        while not stop.is_set():
+            if node.wanted is not Wanted.RUN:
+                node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
+            elif target.number == done:
+                if node.state not in ("arrived", "fault"):
+                    node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
+            else:
+                done = _drive_to(node, stop, env, option, target)
+                continue
+            env.unwrapped.simulation.advance()  # the model stays where the robot is
+    finally:
+        env.close()
+
+
+def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, target: _Target) -> int:
+    """Drive to the newest target; return its number, or one that is still due if it was interrupted by a hold."""
+    robot, policy = env.unwrapped, node.policy
+    number, position = target.number, target.pose
+    goal = [position.x, position.y, position.z] if option == "ee_target_pose" else [position.x, position.y]
+    goal += [0.0] * ((6 if option == "ee_target_pose" else 3) - len(goal))
+    options = {**robot.reset_options(start="here"), option: goal}
+    try:
+        observation, _ = env.reset(options=options)
+    except ValueError as error:  # the robot's refusal, or a target that cannot be
+        node.enter("fault" if isinstance(error, RobotError) else "waiting", str(error))
+        time.sleep(1.0)
+        return number if not isinstance(error, RobotError) else number - 1
+    policy.reset()
+    node.counts["episodes"] += 1
+    node.enter("running", "")
+    while not stop.is_set() and node.wanted is Wanted.RUN and target.number == number:
+        try:
+            action = policy.act(observation)
+        except RlservoError as error:
+            node.enter("holding", error.message)
+            node.counts["late"] += 1
+            robot.simulation.hold()
+            return number - 1
+        observation, _, terminated, truncated, info = env.step(action)
+        node.counts["decisions"] += 1
+        node.enter("running" if info["robot"]["state"] in ("run", "blend_in") else info["robot"]["state"])
+        if terminated or truncated:
+            robot.simulation.hold()
+            status = info["final_status"]
+            node.counts["successes"] += bool(info["is_success"])
+            log.info("node: target %d: %s", number, status)
+            is_fault = robot.simulation.stopped_by is not None
+            node.enter("fault" if is_fault else "arrived", status)
+            return number
+    robot.simulation.hold()
+    return number - 1 if target.number == number else number

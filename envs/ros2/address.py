@@ -1,0 +1,80 @@
+"""Address of a robot behind ROS: `ros2:NAME=VALUE,...` or `rosbridge://HOST:PORT,NAME=VALUE,...`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rlservo.envs.robots.arm import ROS2, ROSBRIDGE, RobotError
+
+ROSBRIDGE_PORT = 9090
+CHOICES = {
+    "command": ("position", "velocity", "trajectory"),
+    "status": ("on", "off"),
+    "twist": ("auto", "Twist", "TwistStamped"),
+    "clock": ("ros", "robot"),
+}
+# Topics of Universal_Robots_ROS2_Driver; `commands` follows from `command`.
+ARM_OPTIONS = {
+    "prefix": "",  # before the joints' names
+    "command": "position",
+    "commands": "",
+    "status": "on",  # off: a robot without speed scaling, modes and program
+    "clock": "ros",
+    "joint_states": "/joint_states",
+    "speed_scaling": "/speed_scaling_state_broadcaster/speed_scaling",
+    "robot_mode": "/io_and_status_controller/robot_mode",
+    "safety_mode": "/io_and_status_controller/safety_mode",
+    "program_running": "/io_and_status_controller/robot_program_running",
+}
+COMMAND_TOPICS = {
+    "position": "/forward_position_controller/commands",
+    "velocity": "/forward_velocity_controller/commands",
+    "trajectory": "/scaled_joint_trajectory_controller/joint_trajectory",
+}
+BASE_OPTIONS = {
+    "odom": "/odom",
+    "cmd_vel": "/cmd_vel",
+    "twist": "auto",
+    "scan": "",  # empty: both scanners' own topics where they are published, else /scan
+    "front_scan": "/f_scan",
+    "back_scan": "/b_scan",
+    "deadman": "",  # a std_msgs/Bool that must be true and fresh while the base moves
+    "clock": "",  # ros, or robot: the robot's clock is not ours; empty: ros with `ros2:`, robot with a rosbridge
+}
+
+
+@dataclass(frozen=True)
+class RosAddress:
+    """Where a robot's topics are, and their names."""
+
+    host: str = ""  # of a rosbridge; empty: ROS 2 itself
+    port: int = ROSBRIDGE_PORT
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> str:
+        return self.options[name]
+
+    @classmethod
+    def parse(cls, robot: str, defaults: Mapping[str, str]) -> RosAddress:
+        """Return the parts of an address. Raises RobotError for an option or a value that does not exist."""
+        place, *settings = robot.split(",")
+        options = dict(defaults)
+        host, port = "", ROSBRIDGE_PORT
+        if place.startswith(ROSBRIDGE):
+            host, _, digits = place.removeprefix(ROSBRIDGE).partition(":")
+            if not host or "/" in host or not (digits.isdecimal() or not digits):
+                raise RobotError(f"robot {robot!r}: expected {ROSBRIDGE}HOST:{ROSBRIDGE_PORT}")
+            port = int(digits or ROSBRIDGE_PORT)
+        elif place.startswith(ROS2):
+            settings = [one for one in (place.removeprefix(ROS2), *settings) if one]
+        else:
+            raise RobotError(f"robot {robot!r}: expected {ROS2}, {ROS2}NAME=VALUE,... or {ROSBRIDGE}HOST:PORT")
+        for setting in settings:
+            name, equals, value = setting.partition("=")
+            if not equals or name not in options:
+                raise RobotError(f"robot {robot!r}: {setting!r} is none of {', '.join(options)} with =VALUE")
+            if name in CHOICES and value not in CHOICES[name]:
+                raise RobotError(f"robot {robot!r}: {name} is {value!r}, expected {' or '.join(CHOICES[name])}")
+            options[name] = value
+        return cls(host, port, options)

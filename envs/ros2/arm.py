@@ -1,0 +1,232 @@
+"""A UR arm behind ROS 2, as the command stream sees it: Universal_Robots_ROS2_Driver's topics."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.ros2.address import ARM_OPTIONS, COMMAND_TOPICS, RosAddress
+from rlservo.envs.ros2.link import open_link, take_command, wait_until
+from rlservo.envs.ros2.messages import (
+    FLAG,
+    INT8,
+    JOINT_NAMES,
+    JOINT_STATE,
+    JOINT_TRAJECTORY,
+    NUMBER,
+    NUMBERS,
+    in_order,
+    stamp_of,
+    trajectory,
+)
+
+if TYPE_CHECKING:
+    from rlservo.envs.robots.command_stream import StreamSettings
+
+FIRST_MESSAGES_S = 30.0
+CLOCK_TOLERANCE_S = 5.0  # older than this at the first message: the clocks differ, no link is so slow
+RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of commands, where the limits name none
+RUNNING = 7
+# Distance of a joint from its setpoint beyond which it does not follow: at rest, and so much of its velocity more.
+FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
+DRIFT_GAIN = 2.0  # [1/s], of velocity commands
+KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTORY}
+
+Vector = NDArray[np.float64]
+
+
+class RosArmConnection:
+    """The arm's topics, under the names of ur_rtde's methods that the command stream calls."""
+
+    def __init__(self, settings: StreamSettings) -> None:
+        """Wait for every input, then take the command topic. Raises RobotError."""
+        self._address = address = RosAddress.parse(settings.host, ARM_OPTIONS)
+        if address.host:
+            raise RobotError(f"robot {settings.host!r}: an arm is reached by ros2: or rtde://, not by a rosbridge")
+        self._how = address["command"]
+        self._limits = settings.limits
+        self.rate_hz = settings.limits.rate_hz or RATE_HZ[self._how]
+        self.receive = self.control = self
+        self._joints = [address["prefix"] + name for name in JOINT_NAMES.values()]
+        self._lock = threading.Lock()
+        self._state: tuple[float, float | None, Vector, Vector] | None = None  # stamp, age, positions, velocities
+        self._problem = f"no message on {address['joint_states']}"
+        self._speed_percent = 100.0 if address["status"] == "off" else float("nan")
+        self._modes: dict[str, int] = {"program_running": 1, "robot_mode": RUNNING, "safety_mode": 1}
+        self._setpoint: Vector | None = None
+        self._fastest = 0.0  # [rad/s], of the setpoints of the last moments
+        self._guard: subprocess.Popen[bytes] | None = None
+        self._link = open_link(address, "rlservo_arm")
+        try:
+            self._subscribe()
+            topic = address["commands"] or COMMAND_TOPICS[self._how]
+            if self._how == "velocity":  # its controller repeats the last command without an end
+                words = [sys.executable, "-m", "rlservo.envs.ros2.velocity_guard", topic]
+                self._guard = subprocess.Popen(words, stdin=subprocess.PIPE, start_new_session=True)
+            self._publish = take_command(self._link, topic, KINDS[self._how])
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Leave the graph; the guard of velocity commands ends with its input, after a last zero."""
+        self._link.close()
+        if self._guard is not None and self._guard.stdin is not None:
+            self._guard.stdin.close()
+            self._guard.wait()
+
+    def age_s(self) -> float | None:
+        """Return how old the newest state was when it came [s], by its stamp; None where the clock is the robot's."""
+        assert self._state is not None
+        return self._state[1]
+
+    # -- receive
+
+    def isConnected(self) -> bool:
+        """Return True: the age of the states says more."""
+        return True
+
+    def getTimestamp(self) -> float:
+        """Return the newest state's stamp [s]."""
+        assert self._state is not None
+        return self._state[0]
+
+    def getActualQ(self) -> list[float]:
+        """Return the joint positions [rad] (6,)."""
+        assert self._state is not None
+        return self._state[2].tolist()
+
+    getTargetQ = getActualQ
+
+    def getActualQd(self) -> list[float]:
+        """Return the joint velocities [rad/s] (6,)."""
+        assert self._state is not None
+        return self._state[3].tolist()
+
+    def getRobotMode(self) -> int:
+        """Return the robot mode, 7 where it runs."""
+        return self._modes["robot_mode"]
+
+    def getSafetyMode(self) -> int:
+        """Return the safety mode, 1 where it is normal."""
+        return self._modes["safety_mode"]
+
+    def getRobotStatus(self) -> int:
+        """Return ur_rtde's bits: 1 for power, 2 for a running program."""
+        return 1 + 2 * self._modes["program_running"]
+
+    def getTargetSpeedFraction(self) -> float:
+        """Return the speed scaling, 0 to 1. With trajectories the controller applies it itself."""
+        return 1.0 if self._how == "trajectory" else self._speed_percent / 100.0
+
+    # -- control
+
+    def servoJ(self, setpoint: Sequence[float], *_: float) -> bool:
+        """Publish the next setpoint [rad] (6,); return False where the arm does not follow."""
+        goal, measured = np.array(setpoint), np.array(self.getActualQ())
+        before = goal if self._setpoint is None else self._setpoint
+        velocity = (goal - before) * self.rate_hz
+        self._setpoint = goal
+        forgotten = self._fastest * (1.0 - 1.0 / (FOLLOWING_LAG_S * self.rate_hz))
+        self._fastest = max(float(np.abs(velocity).max()), forgotten)
+        away = np.abs(goal - measured)
+        if away.max() > FOLLOWING_ERROR + FOLLOWING_LAG_S * self._fastest:
+            joint = self._joints[int(away.argmax())]
+            raise RobotError(
+                f"not_following: {joint} is {away.max():.2f} rad from its setpoint: is the controller of "
+                f"{self._address['commands'] or COMMAND_TOPICS[self._how]} active (ros2 control list_controllers)"
+            )
+        if self._how == "position":
+            self._publish({"data": goal.tolist()})
+        elif self._how == "velocity":
+            self._publish({"data": (velocity + DRIFT_GAIN * (goal - measured) * bool(velocity.any())).tolist()})
+            self.kickWatchdog()
+        else:
+            self._publish(self._trajectory(goal, velocity))
+        return True
+
+    def kickWatchdog(self) -> None:
+        """Feed the guard of velocity commands."""
+        if self._guard is not None and self._guard.stdin is not None:
+            self._guard.stdin.write(b".")
+            self._guard.stdin.flush()
+
+    def servoStop(self) -> None:
+        """Send nothing more: the arm stands, and another node may lead it."""
+        self._setpoint = None
+
+    teachMode = servoStop
+    endTeachMode = servoStop
+
+    # -- parts
+
+    def _trajectory(self, goal: Vector, velocity: Vector) -> dict[str, Any]:
+        """Return two points: the setpoint, and from there a stop, which is the end if no other trajectory comes."""
+        period_s = 1.0 / self.rate_hz
+        stop_s = float(np.abs(velocity).max()) / self._limits.acceleration
+        points: list[tuple[float, Vector, Vector]] = [(2.0 * period_s, goal + velocity * period_s, velocity)]
+        if stop_s > 0.0:
+            at = points[0]
+            points.append((at[0] + stop_s, at[1] + velocity * stop_s / 2.0, np.zeros(6)))
+        return trajectory(self._joints, points)
+
+    def _subscribe(self) -> None:
+        address, link = self._address, self._link
+        link.subscribe(address["joint_states"], JOINT_STATE, self._take_state)
+        if address["status"] == "on":
+            self._modes.clear()
+            link.subscribe(address["speed_scaling"], NUMBER, self._take_speed)
+            for name, own in (("program_running", FLAG), ("robot_mode", ""), ("safety_mode", "")):
+                topic = address[name]
+                wait_until(
+                    lambda topic=topic: bool(link.publishers(topic)),  # type: ignore[misc]  # a default is no argument
+                    f"nothing publishes {topic}: is the driver's io_and_status_controller active (status=off goes "
+                    "without)",
+                    FIRST_MESSAGES_S,
+                )
+                # ur_dashboard_msgs' own type, or a plain number where that package is not installed.
+                kind = own or link.publishers(topic)[0].type or INT8
+                link.subscribe(topic, kind, lambda message, name=name: self._take_mode(name, message), is_kept=True)  # type: ignore[misc]
+        wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
+        age_s = self.age_s()
+        if age_s is not None and abs(age_s) > CLOCK_TOLERANCE_S:
+            raise RobotError(
+                f"{address['joint_states']} has stamps {age_s:.1f} s old: synchronise the clocks (chrony), or say "
+                "clock=robot"
+            )
+
+    def _is_complete(self) -> bool:
+        return self._state is not None and len(self._modes) == 3 and self._speed_percent == self._speed_percent
+
+    def _missing(self) -> str:
+        if self._state is None:
+            return self._problem
+        missing = [name for name in ("program_running", "robot_mode", "safety_mode") if name not in self._modes]
+        topics = [self._address[name] for name in missing or ["speed_scaling"]]
+        return f"no message on {', '.join(topics)} (status=off goes without)"
+
+    def _take_state(self, message: Any) -> None:
+        positions = in_order(message, self._joints, "position")
+        velocities = in_order(message, self._joints, "velocity")
+        made_s = stamp_of(message)
+        if positions is None or velocities is None:
+            names = ", ".join(message.name)
+            self._problem = f"{self._address['joint_states']} lacks some of {', '.join(self._joints)}: it has {names}"
+        elif made_s is None:
+            self._problem = f"{self._address['joint_states']} has no stamps"
+        elif self._state is None or made_s > self._state[0]:
+            age_s = None if self._address["clock"] == "robot" else abs(self._link.now_s() - made_s)
+            self._state = (made_s, age_s, positions, velocities)
+
+    def _take_speed(self, message: Any) -> None:
+        self._speed_percent = float(message.data)
+
+    def _take_mode(self, name: str, message: Any) -> None:
+        self._modes[name] = int(message.data if hasattr(message, "data") else message.mode)

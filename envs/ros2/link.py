@@ -1,0 +1,110 @@
+"""Link to a ROS graph: what the backends, the node and the simulators ask of rclpy or a rosbridge."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.ros2.address import RosAddress
+
+SAID_AFTER_S = 10.0
+LOOK_S = 0.02
+DISCOVERY_S = 1.0  # in which a second node that commands the same robot is noticed
+
+Publish = Callable[[Mapping[str, Any]], None]
+log = logging.getLogger("rlservo.robot")
+
+
+class Endpoint(NamedTuple):
+    """A publisher or subscriber of another node."""
+
+    node: str
+    type: str  # "geometry_msgs/msg/Twist"
+
+
+class Link(Protocol):
+    """A connection to the graph. Callbacks come in a thread of its own, one at a time."""
+
+    def now_s(self) -> float:
+        """Return ROS's time [s]."""
+        ...
+
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
+        """Call `on_message` with each new message; `is_kept`: also with the last one before, where it is kept."""
+        ...
+
+    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
+        """Return a function that publishes a message, given as a dictionary."""
+        ...
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """Return the publishers of other nodes."""
+        ...
+
+    def rivals(self, topic: str) -> list[Endpoint]:
+        """Return those publishers that command what the topic commands."""
+        ...
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        """Return the subscribers of other nodes."""
+        ...
+
+    def close(self) -> None:
+        """Leave the graph."""
+        ...
+
+
+def open_link(address: RosAddress, name: str) -> Link:
+    """Return the link that an address asks for. Raises RobotError where there is no rclpy, or no rosbridge answers."""
+    if address.host:
+        from rlservo.envs.ros2.rosbridge_link import RosbridgeLink
+
+        return RosbridgeLink(address.host, address.port)
+    from rlservo.envs.ros2.rclpy_link import RclpyLink
+
+    return RclpyLink(name)
+
+
+def wait_until(condition: Callable[[], bool], what: Callable[[], str] | str, timeout_s: float) -> None:
+    """Wait for a condition, and say after 10 s for what. Raises RobotError when it does not come true in time."""
+    began, said = time.monotonic(), False
+    while not condition():
+        waited_s = time.monotonic() - began
+        reason = what if isinstance(what, str) else what()
+        if waited_s > timeout_s:
+            raise RobotError(f"{reason}, for {timeout_s:g} s")
+        if waited_s > SAID_AFTER_S and not said:
+            said = True
+            log.warning("still waiting: %s", reason)
+        time.sleep(LOOK_S)
+
+
+def take_command(link: Link, topic: str, kind: str) -> Publish:
+    """Advertise a command topic that no other node may publish on. Raises RobotError naming one that does."""
+
+    def refuse() -> None:
+        if others := link.rivals(topic):
+            names = ", ".join(sorted({one.node for one in others}))
+            raise RobotError(f"{topic} is commanded by {names} already: end it first, a robot obeys one node")
+
+    def is_listened_to() -> bool:
+        refuse()
+        return any(one.type == kind for one in link.subscribers(topic))
+
+    try:
+        wait_until(is_listened_to, f"nothing subscribes to {topic} ({kind}): is its controller running", 20.0)
+    except RobotError:
+        types = {one.type for one in link.subscribers(topic)} - {kind}
+        if types:
+            raise RobotError(f"{topic} takes {', '.join(sorted(types))}, not {kind}") from None
+        raise
+    publish = link.advertise(topic, kind)
+    # Of two that come at once each sees the other, and neither commands.
+    until = time.monotonic() + DISCOVERY_S
+    while time.monotonic() < until:
+        refuse()
+        time.sleep(LOOK_S)
+    return publish

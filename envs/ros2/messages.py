@@ -1,0 +1,164 @@
+"""Conversions between ROS messages and numbers, the same for the node, the backends and the simulators.
+
+A message that arrives has attributes: it is rclpy's own, or a rosbridge's JSON as `parse` makes it. A message that
+leaves is a dictionary, which a link turns into either.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rlservo.envs.mir100.parameters import BACK_SCANNER, FRONT_SCANNER, LASER_MAX, LASER_MIN, Scanner
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+NUMBERS, NUMBER, FLAG = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float64", "std_msgs/msg/Bool"
+INT8 = "std_msgs/msg/Int8"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+# By our own names, in kinematic order.
+JOINT_NAMES = {
+    "base": "shoulder_pan_joint", "shoulder": "shoulder_lift_joint", "elbow": "elbow_joint",
+    "wrist_1": "wrist_1_joint", "wrist_2": "wrist_2_joint", "wrist_3": "wrist_3_joint",
+}  # fmt: skip
+GAP = 3  # beams of a scanner that may be between two points of one surface
+
+Vector = NDArray[np.float64]
+
+
+def parse(value: Any) -> Any:
+    """Return a rosbridge's JSON with attributes in the place of keys."""
+    if isinstance(value, Mapping):
+        return SimpleNamespace(**{name: parse(one) for name, one in value.items()})
+    if isinstance(value, list) and value and isinstance(value[0], Mapping):
+        return [parse(one) for one in value]
+    return value
+
+
+def stamp(time_s: float) -> dict[str, int]:
+    """Return a time [s] as ROS 2 writes it."""
+    whole = math.floor(time_s)
+    return {"sec": whole, "nanosec": min(999_999_999, round((time_s - whole) * 1e9))}
+
+
+def stamp_of(message: Any) -> float | None:
+    """Return when a message was made [s], by its header (ROS 1's or 2's); None where it has none, or it is zero."""
+    made = getattr(getattr(message, "header", None), "stamp", None)
+    if made is None:
+        return None
+    seconds = getattr(made, "sec", None)
+    if seconds is None:
+        return float(made.secs + made.nsecs * 1e-9) or None
+    return float(seconds + made.nanosec * 1e-9) or None
+
+
+def in_order(message: Any, names: Sequence[str], field: str) -> Vector | None:
+    """Return a JointState's values for the joints `names`, whatever its order; None where one is missing."""
+    values, present = getattr(message, field), list(message.name)
+    try:
+        indices = [present.index(name) for name in names]
+        ordered = np.array([values[index] for index in indices], dtype=np.float64)
+    except (ValueError, IndexError):
+        return None
+    return ordered if np.isfinite(ordered).all() else None
+
+
+def yaw_of(orientation: Any) -> float:
+    """Return a quaternion's turn about z [rad]."""
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def quaternion(yaw: float) -> dict[str, float]:
+    """Return a turn about z [rad] as a quaternion."""
+    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2.0), "w": math.cos(yaw / 2.0)}
+
+
+def planar_state(odometry: Any) -> tuple[tuple[float, float, float], tuple[float, float]] | None:
+    """Return an Odometry's x, y [m], yaw [rad] and its velocities [m/s], [rad/s]; None for what is not finite."""
+    pose, twist = odometry.pose.pose, odometry.twist.twist
+    state = (pose.position.x, pose.position.y, yaw_of(pose.orientation)), (twist.linear.x, twist.angular.z)
+    return state if all(map(math.isfinite, (*state[0], *state[1]))) else None
+
+
+def twist(linear: float, angular: float, stamped_s: float | None = None) -> dict[str, Any]:
+    """Return velocities [m/s], [rad/s] as a Twist, or with a time [s] as a TwistStamped."""
+    plain = {"linear": {"x": linear}, "angular": {"z": angular}}
+    if stamped_s is None:
+        return plain
+    return {"header": {"stamp": stamp(stamped_s), "frame_id": "base_link"}, "twist": plain}
+
+
+def trajectory(joints: Sequence[str], points: Sequence[tuple[float, ArrayLike, ArrayLike]]) -> dict[str, Any]:
+    """Return a JointTrajectory that starts at once, of points (time from its start [s], positions, velocities)."""
+    return {
+        "joint_names": list(joints),
+        "points": [
+            {
+                "positions": np.asarray(positions).tolist(),
+                "velocities": np.asarray(velocities).tolist(),
+                "time_from_start": stamp(after_s),
+            }
+            for after_s, positions, velocities in points
+        ],
+    }
+
+
+def scan_message(ranges: Vector, angle_min: float, increment: float, frame: str, made_s: float) -> dict[str, Any]:
+    """Return readings [m] counter-clockwise from an angle [rad] of the frame's x axis as a LaserScan."""
+    return {
+        "header": {"stamp": stamp(made_s), "frame_id": frame},
+        "angle_min": angle_min,
+        "angle_max": angle_min + increment * (len(ranges) - 1),
+        "angle_increment": increment,
+        "range_min": LASER_MIN,
+        "range_max": LASER_MAX,
+        "ranges": ranges.tolist(),
+    }
+
+
+def scan_points(scan: Any, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Vector:
+    """Return where a LaserScan's beams end (n, 2) [m], of those that meet something; `pose` is the scanner's."""
+    ranges = np.array([math.inf if one is None else one for one in scan.ranges], dtype=np.float64)
+    angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges)) + pose[2]
+    meets = np.isfinite(ranges) & (ranges >= scan.range_min) & (ranges < scan.range_max)
+    ranges, angles = ranges[meets], angles[meets]
+    return np.stack([pose[0] + ranges * np.cos(angles), pose[1] + ranges * np.sin(angles)], axis=1)
+
+
+def readings(points: Vector) -> Vector:
+    """Return what the MiR100's two scanners read (1012,) [m] of points (n, 2) [m] in base_link."""
+    return np.concatenate([_seen_by(FRONT_SCANNER, points), _seen_by(BACK_SCANNER, points)])
+
+
+def scanner_pose(scanner: Scanner) -> tuple[float, float, float]:
+    """Return a scanner's x, y [m] and yaw [rad] in base_link."""
+    return scanner.position[0], scanner.position[1], scanner.yaw
+
+
+def _seen_by(scanner: Scanner, points: Vector) -> Vector:
+    x, y, yaw = scanner_pose(scanner)
+    ahead = points - (x, y)
+    angles = (np.arctan2(ahead[:, 1], ahead[:, 0]) - yaw + math.pi) % (2.0 * math.pi) - math.pi
+    beams = np.rint((angles + scanner.HALF_ANGLE) / (2.0 * scanner.HALF_ANGLE / (scanner.BEAMS - 1))).astype(int)
+    inside = (beams >= 0) & (beams < scanner.BEAMS)
+    seen = np.full(scanner.BEAMS, np.inf)
+    np.minimum.at(seen, beams[inside], np.hypot(ahead[inside, 0], ahead[inside, 1]))
+    # A scan from elsewhere leaves gaps between two points of a near surface: a line closes them.
+    hit = np.flatnonzero(np.isfinite(seen))
+    for left, right in itertools.pairwise(hit):
+        if 1 < right - left <= GAP:
+            seen[left : right + 1] = np.linspace(seen[left], seen[right], right - left + 1)
+    seen[~np.isfinite(seen)] = LASER_MAX
+    return np.clip(seen[scanner.dropped_first : scanner.BEAMS - scanner.dropped_last], LASER_MIN, LASER_MAX)

@@ -1,0 +1,164 @@
+"""Link through rclpy, the machine's own: a node, and a thread that takes its messages."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import logging
+import os
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.ros2.link import Endpoint, Publish
+
+ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, for the processes that we start too
+
+log = logging.getLogger("rlservo.robot")
+
+
+class RclpyLink:
+    """A node of ROS 2 under a name of its own: two of one name could not be told apart."""
+
+    def __init__(self, name: str, *, is_unique: bool = False) -> None:
+        """Raise RobotError without rclpy. `is_unique`: the name is used as it is, else our process id follows it."""
+        try:
+            import rclpy
+            from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+            from rclpy.signals import SignalHandlerOptions
+        except ImportError as error:
+            raise RobotError(
+                f"ROS 2's rclpy cannot be imported ({error}): source /opt/ros/DISTRIBUTION/setup.bash, with the Python "
+                "that this ROS 2 is built for"
+            ) from error
+        self._context = rclpy.Context()
+        arguments = [one for one in os.environ.get(ARGUMENTS_VARIABLE, "").split("\n") if one]
+        words = ["--ros-args", *(arguments if is_unique else _without_names(arguments))] if arguments else None
+        try:
+            rclpy.init(args=words, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # rcl's own errors share no base that is public
+            raise RobotError(f"ROS 2 takes no arguments {' '.join(arguments)}: {error}") from error
+        self.node: Any = rclpy.create_node(
+            name if is_unique else f"{name}_{os.getpid()}", context=self._context,
+            automatically_declare_parameters_from_overrides=is_unique,
+        )  # fmt: skip
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+        def spin() -> None:
+            with contextlib.suppress(ExternalShutdownException):
+                self._executor.spin()
+
+        self._thread = threading.Thread(target=spin, name="ros", daemon=True)
+        self._thread.start()
+
+    def now_s(self) -> float:
+        """Return ROS's time [s]: the system's, or /clock's with use_sim_time."""
+        return float(self.node.get_clock().now().nanoseconds * 1e-9)
+
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
+        """Subscribe as sensors' topics are: the newest message, best effort; a kept one reliably."""
+        self.node.create_subscription(message_class(kind), topic, _safe(on_message, topic), self._qos(is_kept, False))
+
+    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
+        """Publish reliably, the newest message alone."""
+        made = message_class(kind)
+        publisher = self.node.create_publisher(made, topic, self._qos(is_kept, True))
+
+        def publish(values: Mapping[str, Any]) -> None:
+            if self._context.ok():
+                publisher.publish(fill(made(), values))
+
+        return publish
+
+    def serve(self, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
+        """Offer a std_srvs/Trigger service."""
+
+        def handle(_request: Any, response: Any) -> Any:
+            response.success, response.message = answer()
+            return response
+
+        self.node.create_service(message_class("std_srvs/srv/Trigger"), name, handle)
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """Return the publishers of other nodes."""
+        return self._others(self.node.get_publishers_info_by_topic(topic))
+
+    def rivals(self, topic: str) -> list[Endpoint]:
+        """Return the publishers of other nodes: a robot obeys one."""
+        return self.publishers(topic)
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        """Return the subscribers of other nodes."""
+        return self._others(self.node.get_subscriptions_info_by_topic(topic))
+
+    def close(self) -> None:
+        """Leave the graph and end the thread."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self._context.try_shutdown()
+        self._thread.join(2.0)
+        self.node.destroy_node()
+
+    def _others(self, infos: Sequence[Any]) -> list[Endpoint]:
+        own = (self.node.get_name(), self.node.get_namespace())
+        return [
+            Endpoint(f"{one.node_namespace.rstrip('/')}/{one.node_name}", one.topic_type)
+            for one in infos
+            if (one.node_name, one.node_namespace) != own
+        ]
+
+    @staticmethod
+    def _qos(is_kept: bool, is_reliable: bool) -> Any:
+        from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+
+        reliable, best = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
+        durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if is_kept else QoSDurabilityPolicy.VOLATILE
+        return QoSProfile(depth=1, reliability=reliable if is_reliable or is_kept else best, durability=durability)
+
+
+@functools.cache
+def message_class(kind: str) -> Any:
+    """Return the class of 'sensor_msgs/msg/JointState'. Raises RobotError where its package is not installed."""
+    package, _, rest = kind.partition("/")
+    folder, _, name = rest.rpartition("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{folder or 'msg'}"), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise RobotError(f"the ROS 2 interface {kind!r} is not installed here: {error}") from error
+
+
+def fill(message: Any, values: Mapping[str, Any]) -> Any:
+    """Set the fields of a message that a dictionary names, and return it."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            fill(getattr(message, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            kind = message.get_fields_and_field_types()[name].removeprefix("sequence<").partition(">")[0]
+            made = message_class(kind.replace("/", "/msg/"))
+            setattr(message, name, [fill(made(), one) for one in value])
+        else:
+            setattr(message, name, value)
+    return message
+
+
+def _without_names(arguments: Sequence[str]) -> list[str]:
+    """Return ROS arguments without those that would give all our nodes one name."""
+    kept = list(arguments)
+    for index in reversed(range(len(kept))):
+        if kept[index].startswith(("__node:=", "__name:=")):
+            del kept[max(index - 1, 0) : index + 1]
+    return kept
+
+
+def _safe(on_message: Callable[[Any], None], topic: str) -> Callable[[Any], None]:
+    """Let a message that nobody expected end neither the thread nor what it drives."""
+
+    def take(message: Any) -> None:
+        try:
+            on_message(message)
+        except Exception:
+            log.exception("a message on %s cannot be understood", topic)
+
+    return take

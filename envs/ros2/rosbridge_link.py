@@ -1,0 +1,93 @@
+"""Link through a rosbridge (WebSocket), with roslibpy: no ROS on our side. A MiR has one on port 9090."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.ros2.link import Endpoint, Publish
+from rlservo.envs.ros2.messages import parse
+
+CONNECT_S = 10.0
+CALL_S = 5.0
+
+
+class RosbridgeLink:
+    """A client of a rosbridge. Its node there is the bridge's own, which all its clients share."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """Raise RobotError without roslibpy, or where no rosbridge answers."""
+        try:
+            import roslibpy
+        except ImportError as error:
+            how = "pip install '.[rosbridge]' in the checkout of rlservo"
+            raise RobotError(f"a rosbridge needs roslibpy ({error}): {how}") from error
+        self._library: Any = roslibpy
+        self._ros: Any = roslibpy.Ros(host, port)
+        self._topics: list[Any] = []
+        try:
+            self._ros.run(timeout=CONNECT_S)
+        except Exception as error:
+            self._ros.close()
+            raise RobotError(f"no rosbridge answers at {host}:{port}: is the robot on this network?") from error
+
+    def now_s(self) -> float:
+        """Return the system's time [s]."""
+        return time.time()
+
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
+        """Subscribe to the newest message."""
+        del is_kept  # the bridge's own subscription decides
+        one = self._library.Topic(self._ros, topic, kind, queue_length=1)
+        one.subscribe(lambda message: on_message(parse(message)))
+        self._topics.append(one)
+
+    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
+        """Publish the newest message alone."""
+        one = self._library.Topic(self._ros, topic, kind, queue_size=1, latch=is_kept)
+        one.advertise()
+        self._topics.append(one)
+
+        def publish(values: Mapping[str, Any]) -> None:
+            if self._ros.is_connected:
+                one.publish(self._library.Message(values))
+
+        return publish
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """Return the nodes that publish, the bridge for its other clients, under the topic's type."""
+        return self._nodes("publishers", topic)
+
+    def rivals(self, topic: str) -> list[Endpoint]:
+        """Return the bridge, where another client of it publishes; a robot's own nodes may always do."""
+        if any(one.name == topic and one.is_advertised for one in self._topics):
+            return []
+        return [one for one in self.publishers(topic) if "rosbridge" in one.node]
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        """Return the nodes that subscribe, under the topic's type."""
+        return self._nodes("subscribers", topic)
+
+    def close(self) -> None:
+        """Unsubscribe and close the connection."""
+        for one in self._topics:
+            one.unadvertise() if one.is_advertised else one.unsubscribe()
+        self._ros.close()
+
+    def _nodes(self, which: str, topic: str) -> list[Endpoint]:
+        nodes = self._call(which, topic).get(which, [])
+        kind = self._call("topic_type", topic).get("type", "") if nodes else ""
+        if "/msg/" not in kind:  # ROS 1's spelling
+            kind = kind.replace("/", "/msg/")
+        return [Endpoint(node, kind) for node in nodes]
+
+    def _call(self, service: str, topic: str) -> Mapping[str, Any]:
+        kind = f"rosapi/{service.title().replace('_', '')}"
+        caller = self._library.Service(self._ros, f"/rosapi/{service}", kind)
+        try:
+            answer: Mapping[str, Any] = caller.call(self._library.ServiceRequest({"topic": topic}), timeout=CALL_S)
+        except Exception as error:  # a time-out, or the bridge's refusal
+            raise RobotError(f"the rosbridge does not answer /rosapi/{service} for {topic}: {error}") from error
+        return answer

@@ -1,0 +1,41 @@
+"""Guard of a velocity topic: publishes zeros when its standard input falls silent, and once when it ends.
+
+ros2_control's forward velocity controller has no time-out: the arm of a process that was killed would move on.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+
+from rlservo.envs.ros2.messages import NUMBERS
+from rlservo.envs.ros2.rclpy_link import RclpyLink
+
+SILENCE_S = 0.1
+SETTLE_S = 0.5  # in which the last zeros reach the controller
+
+
+def main(topic: str) -> None:
+    """Guard a topic until standard input ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    link = RclpyLink("rlservo_guard")
+    publish, is_fed = None, False
+    while True:
+        ready, _, _ = select.select([0], [], [], SILENCE_S)
+        if ready and not os.read(0, 4096):
+            break
+        is_fed = is_fed or bool(ready)
+        if not ready and is_fed:
+            publish = publish or link.advertise(topic, NUMBERS)
+            publish({"data": [0.0] * 6})
+    for _ in range(int(SETTLE_S / SILENCE_S) if is_fed else 0):  # else the topic may be another node's
+        publish = publish or link.advertise(topic, NUMBERS)
+        publish({"data": [0.0] * 6})
+        select.select([], [], [], SILENCE_S)
+    link.close()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
