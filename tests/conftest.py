@@ -26,6 +26,7 @@ pytest_plugins = [
     "browser",
     "checkpoints",
     "arms",
+    "ros",
     "bundles",
     "clusters",
     "cockpits",

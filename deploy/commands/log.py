@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,7 +35,7 @@ class Format(str, Enum):
 
 @log.command()
 def info(files: Files, as_json: Json = False) -> None:
-    """Show the content of recordings, and what is missing.
+    """Show the content of recordings, and what is missing. ROS 2 bags (.mcap) may be among them.
 
     Example: `rlservo log info recordings`
     """
@@ -43,7 +43,7 @@ def info(files: Files, as_json: Json = False) -> None:
         from rlservo.serve_app.recording.reader import Recording
         from rlservo.serve_app.recording.summary import summarise_recording
 
-    summary = summarise_recording(Recording(files))
+    summary = summarise_recording(Recording(files, with_bags=True))
     if as_json:
         print_json(summary.as_dict())
     else:
@@ -126,6 +126,8 @@ def _print_summary(summary: Summary) -> None:
     for file in summary.files:
         state = "whole" if file["whole"] else "being written" if file["being_written"] else "without an end"
         notes = [f"{file['messages']} messages", state]
+        if file["bag_topics"]:
+            notes = [f"a ROS 2 bag, {_bag(file, summary)}", *notes[1:]]
         if file["dropped"]:
             notes.append(f"{file['dropped']} records were dropped")
         if file["clock_jumps"]:
@@ -147,6 +149,14 @@ def _print_summary(summary: Summary) -> None:
             f"  explored {policy.explored}, warnings {policy.warnings}, without an action {policy.without_action}, "
             f"fallbacks {policy.fallbacks}, episodes with a gap {policy.gaps}"
         )
+
+
+def _bag(file: dict[str, Any], summary: Summary) -> str:
+    """Say what a bag holds, and where its time is beside that of the decisions: both count from 1970."""
+    topics = ", ".join(f"{topic} {count}" for topic, count in sorted(file["bag_topics"].items()))
+    first_s = min((policy.first_s for policy in summary.policies), default=None)
+    begins = "" if first_s is None else f", from {file['bag_first_s'] - first_s:+.1f} s of the first decision"
+    return f"{file['messages']} messages over {file['bag_last_s'] - file['bag_first_s']:.1f} s{begins} ({topics})"
 
 
 def _line(text: str) -> None:

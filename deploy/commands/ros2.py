@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import threading
 from contextlib import ExitStack
 from pathlib import Path
@@ -158,6 +159,7 @@ def ros2_sim(
             simulated,
             stop,
             lambda: terminal.show(f"{robot} on {' and '.join(where)}; help and Enter lists commands, Ctrl-C ends it"),
+            sys.stdin,
         )
 
 

@@ -124,8 +124,9 @@ def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | 
         raise UsageError(f"policy {contract.name!r} states no control rate: give --rate")
     observed, acted = places(contract, node.parameters())
     inputs = ElementInputs(node.link, observed, max_age_s or max(0.1, 2.0 / rate_hz))
-    kinds = {place.topic: place.kind for place in acted}
-    outputs = ElementOutputs(acted, {topic: take_command(node.link, topic, kind) for topic, kind in kinds.items()})
+    kinds, name_of = {place.topic: place.kind for place in acted}, node.link.node.resolve_topic_name
+    publishers = {topic: take_command(node.link, name_of(topic), kind) for topic, kind in kinds.items()}
+    outputs = ElementOutputs(acted, publishers)
     due, was_running = time.monotonic(), False
     while not stop.is_set():
         due = max(due + 1.0 / rate_hz, time.monotonic())
@@ -180,6 +181,7 @@ def drive_environment(
             check_proven(node.policy.contract, env)
         target = _Target(frame)
         node.link.subscribe("~/target", POSE_STAMPED, target.take, is_kept=False)
+        robot: Any = env.unwrapped
         done = 0
         while not stop.is_set():
             if node.wanted is not Wanted.RUN:
@@ -190,7 +192,7 @@ def drive_environment(
             else:
                 done = _drive_to(node, stop, env, option, target)
                 continue
-            env.unwrapped.simulation.advance()  # the model stays where the robot is
+            robot.simulation.advance()  # the model stays where the robot is
     finally:
         env.close()
 

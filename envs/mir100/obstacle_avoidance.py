@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -92,7 +92,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     immediate.
     """
 
-    RESET_OPTIONS = (*Mir100Navigation.RESET_OPTIONS, "cubes")
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = (*Mir100Navigation.RESET_OPTIONS, "cubes")
     WORLD = LAB_6X8.name
     LASER_COUNT = 16
     SUCCESS_REWARD = 100.0

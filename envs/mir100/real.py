@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from rlservo.envs.checks import InvalidResetError
 from rlservo.envs.mir100.navigation import Mir100Navigation
@@ -16,7 +16,7 @@ from rlservo.envs.rendering import Start
 class _RealBase(Mir100Navigation):
     """What a real base changes: an episode begins where it stands, and its world is not known."""
 
-    RESET_OPTIONS = ("target_pose",)
+    RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("target_pose",)
 
     def __init__(self, *, robot: str = "", **arguments: Any) -> None:
         if not robot:

@@ -101,14 +101,14 @@ class RosArmConnection:
     def getActualQ(self) -> list[float]:
         """Return the joint positions [rad] (6,)."""
         assert self._state is not None
-        return self._state[2].tolist()
+        return [float(value) for value in self._state[2]]
 
     getTargetQ = getActualQ
 
     def getActualQd(self) -> list[float]:
         """Return the joint velocities [rad/s] (6,)."""
         assert self._state is not None
-        return self._state[3].tolist()
+        return [float(value) for value in self._state[3]]
 
     def getRobotMode(self) -> int:
         """Return the robot mode, 7 where it runs."""

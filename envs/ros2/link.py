@@ -86,6 +86,9 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
     """Advertise a command topic that no other node may publish on. Raises RobotError naming one that does."""
 
     def refuse() -> None:
+        if not link.rivals(topic):
+            return
+        time.sleep(DISCOVERY_S)  # one that is just leaving, or whose name is not known yet
         if others := link.rivals(topic):
             names = ", ".join(sorted({one.node for one in others}))
             raise RobotError(f"{topic} is commanded by {names} already: end it first, a robot obeys one node")
@@ -108,3 +111,15 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
         refuse()
         time.sleep(LOOK_S)
     return publish
+
+
+def safely(on_message: Callable[[Any], None], topic: str) -> Callable[[Any], None]:
+    """Return a callback that a message of another form ends neither with its thread nor with what it drives."""
+
+    def take(message: Any) -> None:
+        try:
+            on_message(message)
+        except Exception as error:  # anybody's message
+            log.warning("a message on %s cannot be understood: %s: %s", topic, type(error).__name__, error)
+
+    return take

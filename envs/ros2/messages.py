@@ -161,4 +161,5 @@ def _seen_by(scanner: Scanner, points: Vector) -> Vector:
         if 1 < right - left <= GAP:
             seen[left : right + 1] = np.linspace(seen[left], seen[right], right - left + 1)
     seen[~np.isfinite(seen)] = LASER_MAX
-    return np.clip(seen[scanner.dropped_first : scanner.BEAMS - scanner.dropped_last], LASER_MIN, LASER_MAX)
+    kept: Vector = np.clip(seen[scanner.dropped_first : scanner.BEAMS - scanner.dropped_last], LASER_MIN, LASER_MAX)
+    return kept

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -38,7 +38,7 @@ class MirroredMir100(Mir100Simulation):
         self._is_up = True
         self._operator = Operator(is_asked=confirm)
         self.states = StateMachine()
-        self._make = lambda: RosBase(
+        self._make: Callable[[], RosBase] = lambda: RosBase(
             robot, limits=BaseLimits.of(dict(limits)), setpoint_timeout_s=LATE_CYCLES * CYCLE_S, needs_scan=needs_scan
         )
         self._readings: Vector = np.full(BEAM_COUNT, LASER_MAX)

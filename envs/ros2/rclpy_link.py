@@ -5,18 +5,15 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
-import logging
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rlservo.envs.robots.arm import RobotError
-from rlservo.envs.ros2.link import Endpoint, Publish
+from rlservo.envs.ros2.link import Endpoint, Publish, safely
 
 ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, for the processes that we start too
-
-log = logging.getLogger("rlservo.robot")
 
 
 class RclpyLink:
@@ -60,7 +57,7 @@ class RclpyLink:
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
         """Subscribe as sensors' topics are: the newest message, best effort; a kept one reliably."""
-        self.node.create_subscription(message_class(kind), topic, _safe(on_message, topic), self._qos(is_kept, False))
+        self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), self._qos(is_kept, False))
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
         """Publish reliably, the newest message alone."""
@@ -150,15 +147,3 @@ def _without_names(arguments: Sequence[str]) -> list[str]:
         if kept[index].startswith(("__node:=", "__name:=")):
             del kept[max(index - 1, 0) : index + 1]
     return kept
-
-
-def _safe(on_message: Callable[[Any], None], topic: str) -> Callable[[Any], None]:
-    """Let a message that nobody expected end neither the thread nor what it drives."""
-
-    def take(message: Any) -> None:
-        try:
-            on_message(message)
-        except Exception:
-            log.exception("a message on %s cannot be understood", topic)
-
-    return take

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from rlservo.envs.robots.arm import RobotError
-from rlservo.envs.ros2.link import Endpoint, Publish
+from rlservo.envs.ros2.link import Endpoint, Publish, safely
 from rlservo.envs.ros2.messages import parse
 
 CONNECT_S = 10.0
@@ -25,13 +26,22 @@ class RosbridgeLink:
             how = "pip install '.[rosbridge]' in the checkout of rlservo"
             raise RobotError(f"a rosbridge needs roslibpy ({error}): {how}") from error
         self._library: Any = roslibpy
+        try:
+            socket.create_connection(
+                (host, port), CONNECT_S
+            ).close()  # roslibpy tries again and again, and says nothing
+        except OSError as error:
+            reason = error.strerror or "no answer"
+            raise RobotError(
+                f"no rosbridge answers at {host}:{port} ({reason}): is the robot on, and on this network"
+            ) from error
         self._ros: Any = roslibpy.Ros(host, port)
         self._topics: list[Any] = []
         try:
             self._ros.run(timeout=CONNECT_S)
         except Exception as error:
             self._ros.close()
-            raise RobotError(f"no rosbridge answers at {host}:{port}: is the robot on this network?") from error
+            raise RobotError(f"what answers at {host}:{port} is no rosbridge: {error}") from error
 
     def now_s(self) -> float:
         """Return the system's time [s]."""
@@ -41,7 +51,7 @@ class RosbridgeLink:
         """Subscribe to the newest message."""
         del is_kept  # the bridge's own subscription decides
         one = self._library.Topic(self._ros, topic, kind, queue_length=1)
-        one.subscribe(lambda message: on_message(parse(message)))
+        one.subscribe(safely(lambda message: on_message(parse(message)), topic))
         self._topics.append(one)
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
@@ -64,7 +74,8 @@ class RosbridgeLink:
         """Return the bridge, where another client of it publishes; a robot's own nodes may always do."""
         if any(one.name == topic and one.is_advertised for one in self._topics):
             return []
-        return [one for one in self.publishers(topic) if "rosbridge" in one.node]
+        nodes = [one for one in self.publishers(topic) if "rosbridge" in one.node]
+        return [Endpoint(f"another client of {one.node}", one.type) for one in nodes]
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         """Return the nodes that subscribe, under the topic's type."""

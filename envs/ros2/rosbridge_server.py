@@ -26,7 +26,7 @@ BRIDGE, ROBOT = "/rosbridge_websocket", "/robot"
 
 log = logging.getLogger("rlservo.robot")
 websocket_log = logging.getLogger("rlservo.rosbridge")
-websocket_log.setLevel(logging.WARNING)  # not each connection that comes and goes
+websocket_log.setLevel(logging.CRITICAL)  # not each connection that comes and goes, whatever it says
 
 
 class _Client:
@@ -183,12 +183,13 @@ class RosbridgeServer:
         with self._lock:
             by_clients = {name: [BRIDGE] * any(topic in getattr(one, name) for one in self._clients)
                           for name in ("advertised", "subscribed")}  # fmt: skip
-        values: dict[str, Any] | None = {
+        known: dict[str, dict[str, Any]] = {
             "/rosapi/topics": {"topics": list(self._types), "types": list(self._types.values())},
             "/rosapi/topic_type": {"type": self._types.get(topic, "")},
             "/rosapi/publishers": {"publishers": [ROBOT] * (topic in self._published) + by_clients["advertised"]},
             "/rosapi/subscribers": {"subscribers": [ROBOT] * (topic in self._takers) + by_clients["subscribed"]},
-        }.get(service)
+        }
+        values = known.get(service)
         answer = {"op": "service_response", "id": request.get("id"), "service": service, "result": values is not None,
                   "values": values if values is not None else f"service {service} does not exist"}  # fmt: skip
         self._count += 1

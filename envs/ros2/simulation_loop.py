@@ -7,12 +7,12 @@ import itertools
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 
-from rlservo.envs.ros2.link import Publish
+from rlservo.envs.ros2.link import Publish, safely
 from rlservo.envs.ur_controller.server import Link as LinkFaults
 
 LONGEST_CATCH_UP_S = 0.5  # [s] of cycles that a loop which was held up makes good
@@ -57,6 +57,7 @@ class FaultyLink:
 
     def incoming(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
         """Return a callback that has a message taken in the loop's thread."""
+        take = safely(take, "a command topic")
         return lambda message: self._pass(lambda: take(message), may_wait=False)
 
     def deliver(self) -> None:
@@ -80,13 +81,15 @@ class FaultyLink:
             heapq.heappush(self._waiting, (time.monotonic() + delay_s, next(self._count), deliver))
 
 
-def run(robot: SimulatedRobot, stop: threading.Event, on_ready: Callable[[], None]) -> None:
-    """Run a robot in real time until `stop` is set, and obey the lines on standard input meanwhile."""
+def run(
+    robot: SimulatedRobot, stop: threading.Event, on_ready: Callable[[], None], console: Iterable[str] = ()
+) -> None:
+    """Run a robot in real time until `stop` is set, and obey the console's lines meanwhile."""
     lines: list[str] = []
 
     def read_lines() -> None:
-        for line in sys.stdin:
-            lines.append(line)
+        for line in console:
+            lines.append(line)  # each as it comes
 
     threading.Thread(target=read_lines, name="console", daemon=True).start()
     on_ready()

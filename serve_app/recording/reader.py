@@ -14,7 +14,7 @@ from typing import Any
 
 import orjson
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata
+from mcap.records import Attachment, Channel, Chunk, Header, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from pydantic import ValidationError
 
@@ -26,6 +26,7 @@ from rlservo.serve_app.recording.recorder import SUFFIX, is_being_written
 
 LARGEST_RECORD = 512 * 1024 * 1024  # a larger length is damage
 CLOCK_JUMP_NS = 1_000_000_000
+BAG_PROFILE = "ros2"  # of what `ros2 bag record` writes
 
 
 class RecordingError(RlservoError):
@@ -62,13 +63,20 @@ class FileFacts:
     dropped: int = 0
     clock_jumps: int = 0
     """Number of times that the wall clock moved by more than a second against the monotonic clock."""
+    profile: str = ""
+    """'rlservo', or 'ros2' for a bag."""
+    bag_topics: dict[str, int] = field(default_factory=dict)
+    """Messages of a bag by topic."""
+    bag_first_s: float | None = None
+    bag_last_s: float | None = None
 
 
 class Recording:
     """The recordings in some files and folders, read one after the other."""
 
-    def __init__(self, paths: Sequence[str | Path] | str | Path) -> None:
-        """Raise RecordingError if there is no file."""
+    def __init__(self, paths: Sequence[str | Path] | str | Path, *, with_bags: bool = False) -> None:
+        """Raise RecordingError if there is no file. `with_bags`: ROS 2 bags may be among them, without decisions."""
+        self.with_bags = with_bags
         given = [paths] if isinstance(paths, str | Path) else list(paths)
         self.paths: list[Path] = []
         for path in map(Path, given):
@@ -151,7 +159,7 @@ class FileReader:
         self._facts = facts
         self._contracts: dict[str, Contract] = {}
         self._channels: dict[int, tuple[PolicyFormat | None, str]] = {}
-        self._foreign: set[str] = set()
+        self._foreign: dict[int, str] = {}
         self._offset_ns: int | None = None
 
     def entries(self) -> Iterator[Entry]:
@@ -166,10 +174,11 @@ class FileReader:
                 break
             if entry is not None:
                 yield entry
-        if self._foreign and not self._channels:
+        is_bag = self._recording.with_bags and self._facts.profile == BAG_PROFILE
+        if self._foreign and not self._channels and not is_bag:
             raise RecordingError(
                 f"{self._facts.path} holds no decisions of rlservo's policies: its topics are "
-                f"{', '.join(sorted(self._foreign)[:5])}"
+                f"{', '.join(sorted(self._foreign.values())[:5])}"
             )
 
     def _take(self, record: McapRecord) -> Entry | None:
@@ -179,6 +188,8 @@ class FileReader:
             self._add_channel(record)
         elif isinstance(record, Attachment):
             self._add_contract(record)
+        elif isinstance(record, Header):
+            self._facts.profile = record.profile
         elif isinstance(record, Metadata) and record.name == "rlservo":
             self._facts.metadata = dict(record.metadata)
         return None
@@ -186,6 +197,7 @@ class FileReader:
     def _entry(self, message: Message) -> Entry | None:
         policy, kind = self._channels.get(message.channel_id, (None, ""))
         if kind == "":
+            self._count_in_bag(message)
             return None
         fields = orjson.loads(message.data)
         self._facts.messages += 1
@@ -197,6 +209,15 @@ class FileReader:
             self._facts.clock_jumps += 1
         self._offset_ns = offset
         return Entry(policy, kind, message.log_time, message.publish_time, fields)
+
+    def _count_in_bag(self, message: Message) -> None:
+        facts, topic = self._facts, self._foreign.get(message.channel_id)
+        if topic is not None and facts.profile == BAG_PROFILE:
+            facts.messages += 1
+            facts.bag_topics[topic] = facts.bag_topics.get(topic, 0) + 1
+            time_s = message.log_time / 1e9
+            facts.bag_first_s = time_s if facts.bag_first_s is None else min(facts.bag_first_s, time_s)
+            facts.bag_last_s = time_s if facts.bag_last_s is None else max(facts.bag_last_s, time_s)
 
     def _add_contract(self, attachment: Attachment) -> None:
         if not attachment.name.startswith("contracts/"):
@@ -219,7 +240,7 @@ class FileReader:
         contract = self._contracts.get(channel.metadata.get("contract_sha256", ""))
         kind = channel.topic.rpartition("/")[2]
         if contract is None or kind not in ("decision", "outcome"):
-            self._foreign.add(channel.topic)
+            self._foreign[channel.id] = channel.topic
             return
         graph_hash = channel.metadata.get("graph_sha256", "")
         options = orjson.loads(channel.metadata.get("options", "{}"))

@@ -1,0 +1,142 @@
+"""A policy of no robot of ours as a node: elements by name or by a parameter file, from other nodes' messages."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from bundles import write_box_policy
+from environments import environment_with
+from rlservo.serve_app.runtime.policy import Policy
+from ros import PYTHON, Process, Ros
+
+JOINTS = ("shoulder", "elbow", "wrist")
+COMMANDS, REST = "/forward_command_controller/commands", "/rest"
+MAX_AGE_S = 0.6
+
+
+def mapping(path: Path) -> Path:
+    """The first elements are joints, one of them in degrees; the others are one array."""
+    lines = [
+        f'    observation.element_{index}: "/joint_states sensor_msgs/msg/JointState position[{joint}]{unit}"'
+        for index, (joint, unit) in enumerate(zip(JOINTS, ("", "", " * 57.29577951308232"), strict=True))
+    ]
+    lines += [
+        f'    observation.element_{index}: "{REST} std_msgs/msg/Float64MultiArray data[{index - 3}]"'
+        for index in range(3, 27)
+    ]
+    path.write_text("\n".join(["/**:", "  ros__parameters:", *lines]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_box_policy(tmp_path_factory.mktemp("mapped"))
+
+
+@pytest.fixture(scope="module")
+def node(ros: Ros, bundle: Path) -> Process:
+    ros.ask("subscribe", topic=COMMANDS, kind="std_msgs/msg/Float64MultiArray")
+    ros.ask("subscribe", topic="/diagnostics", kind="diagnostic_msgs/msg/DiagnosticArray")
+    return ros.rlservo(
+        "ros2", "--bundle", bundle, "--mapping", mapping(bundle / "map.yaml"), "--max-age", MAX_AGE_S,
+        "--ros-args", "-r", f"~/action:={COMMANDS}",
+    )  # fmt: skip
+
+
+def send(ros: Ros, positions: dict[str, float], *, age_s: float = 0.0, rest: bool = True) -> None:
+    """Publish what the policy observes; `positions` in the order of the message."""
+    values: dict[str, Any] = {"name": list(positions), "position": list(positions.values())}
+    ros.ask("publish", topic="/joint_states", kind="sensor_msgs/msg/JointState", values=values, age_s=age_s)
+    if rest:
+        ros.ask("publish", topic=REST, kind="std_msgs/msg/Float64MultiArray", values={"data": [0.5] * 24})
+
+
+def actions_since(ros: Ros, time_s: float) -> list[list[float]]:
+    return [message["data"] for _, message in ros.ask("since", topic=COMMANDS, time_s=time_s)]
+
+
+def until_state(ros: Ros, text: str, meanwhile: Any = lambda: None) -> None:
+    ros.wait_until(lambda: (meanwhile(), text in ros.heartbeat()["message"])[1])
+
+
+def test_node_waits_for_every_input_and_a_start_then_acts_on_ordered_joints(
+    ros: Ros, node: Process, bundle: Path
+) -> None:
+    until_state(ros, "stopped")
+    assert ros.ask("call", service="/rlservo/start")["success"]
+    until_state(ros, "waiting: no message on /joint_states")
+    scrambled = {"wrist": 0.1, "other": 9.0, "shoulder": 0.3, "elbow": -0.2}
+    until_state(ros, f"waiting: no message on {REST}", lambda: send(ros, scrambled, rest=False))
+    assert actions_since(ros, 0.0) == []
+
+    until_state(ros, "running", lambda: send(ros, scrambled))
+    with Policy.load(bundle) as policy:
+        observation = np.array([0.3, -0.2, np.degrees(0.1), *[0.5] * 24], np.float32)
+        assert actions_since(ros, 0.0)[-1] == pytest.approx(policy.act(observation).tolist(), abs=1e-6)
+    assert ros.ask("call", service="/rlservo/version")["message"] == "ur5 1"
+
+
+def test_stale_stamps_a_lost_topic_and_a_missing_joint_are_not_acted_on(ros: Ros, node: Process) -> None:
+    joints = dict.fromkeys(JOINTS, 0.0)
+    until_state(ros, "running", lambda: send(ros, joints))
+    for publish, why in (
+        (lambda: send(ros, joints, age_s=5.0), "holding: the newest message on /joint_states is 5."),
+        (lambda: send(ros, joints, age_s=-5.0), "holding: the newest message on /joint_states is 5."),
+        (lambda: send(ros, {"shoulder": 0.0, "elbow": 0.0}), "holding: a message on /joint_states has no finite"),
+        (lambda: send(ros, {**joints, "wrist": float("nan")}), "holding: a message on /joint_states has no finite"),
+        (lambda: None, "holding: the newest message on"),
+    ):
+        until_state(ros, why, publish)
+        began_s = time.time()
+        time.sleep(0.3)
+        assert actions_since(ros, began_s) == []
+        until_state(ros, "running", lambda: send(ros, joints))
+    ros.ask("call", service="/rlservo/hold")
+    until_state(ros, "holding: asked for", lambda: send(ros, joints))
+
+
+def test_second_node_on_the_same_topic_is_refused(ros: Ros, node: Process, bundle: Path) -> None:
+    second = ros.rlservo("ros2", "--bundle", bundle, "--name", "second", "--ros-args", "-r", f"~/action:={COMMANDS}")
+    line = second.wait_for("is commanded by")
+    assert "/rlservo already: end it first" in line
+    assert second.end(0) == 2
+    assert ros.heartbeat()["state"] in ("holding", "running")
+
+
+def test_mapping_of_no_element_is_one_sentence(ros: Ros, bundle: Path) -> None:
+    wrong = ros.rlservo(
+        "ros2", "--bundle", bundle, "--name", "wrong", "--ros-args", "-p", "observation.speed:=/x std_msgs/msg/Bool a"
+    )
+    wrong.wait_for("parameter 'observation.speed' maps no element: expected one of observation.element_0")
+    assert wrong.end(0) == 2
+
+
+def test_ros_2_finds_the_package_its_executable_and_launch_file(ros: Ros, wheel: Path, tmp_path: Path) -> None:
+    """`ros2 run` and `ros2 launch` look for these places; the tools themselves are no packages of PyPI's."""
+    prefix = tmp_path / "environment"
+    environment_with(wheel, prefix)
+    program = (
+        "from ament_index_python.packages import get_package_prefix, get_package_share_directory as share; "
+        "print(get_package_prefix('rlservo'), share('rlservo'))"
+    )
+    variables = os.environ | {"AMENT_PREFIX_PATH": str(prefix)}
+    told = subprocess.run([str(PYTHON), "-c", program], env=variables, capture_output=True, text=True, timeout=60)
+    assert told.stdout.split() == [str(prefix), str(prefix / "share/rlservo")], told.stderr
+    launch = ElementTree.parse(prefix / "share/rlservo/launch/policy.launch.xml").getroot()
+    [started] = launch.iter("node")
+    shown = subprocess.run(
+        [prefix / "lib" / started.attrib["pkg"] / started.attrib["exec"], "--help"],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert shown.returncode == 0, shown.stderr
+    given = [word for word in started.attrib["args"].split() if word.startswith("--")]
+    assert given
+    assert all(word in shown.stdout for word in given)

@@ -1,0 +1,142 @@
+"""An arm behind ROS 2: the shipped policy through topics, and what stops the arm, by nodes of the real rclpy."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ros import Process, Ros
+
+TARGETS = int(os.environ.get("RLSERVO_ROS_TARGETS", "4"))
+PREFIX = "left_"
+FAST = 0.2  # [rad/s]
+BRAKING_S = 0.6  # at 5 rad/s^2, servoj's lag and a busy machine
+
+
+@pytest.fixture(scope="module")
+def sim(ros: Ros) -> Process:
+    """A UR5 whose joints have a prefix; its driver's joint states are in another order than ours."""
+    sim = ros.rlservo("ros2-sim", "ur5", "--prefix", PREFIX)
+    sim.wait_for("ur5 on ROS 2")
+    ros.ask("subscribe", topic="/joint_states", kind="sensor_msgs/msg/JointState")
+    ros.ask("subscribe", topic="/diagnostics", kind="diagnostic_msgs/msg/DiagnosticArray")
+    return sim
+
+
+@pytest.fixture
+def node(ros: Ros, sim: Process, all_shipped: Path) -> Iterator[Process]:
+    """The node of a shipped policy, at three times its usual speed."""
+    node = start_node(ros, all_shipped)
+    try:
+        yield node
+    finally:
+        node.close()
+
+
+def start_node(ros: Ros, all_shipped: Path, *options: object) -> Process:
+    return ros.rlservo(
+        "ros2", "--bundle", all_shipped / "ur_positioning", "--robot", f"ros2:prefix={PREFIX}",
+        "--env-arg", "ur_model=ur5", "--env-arg", "max_velocity_scale_factor=0.3", "--unproven", "--autostart",
+        *options,
+    )  # fmt: skip
+
+
+def give_target(ros: Ros, turn: float, radius: float = 0.5, height: float = 0.4) -> None:
+    """Publish a target, `turn` [rad] from where the arm points at its start."""
+    position = {"x": -radius * math.cos(turn), "y": -radius * math.sin(turn), "z": height}
+    ros.ask(
+        "publish", topic="/rlservo/target", kind="geometry_msgs/msg/PoseStamped",
+        values={"header": {"frame_id": "base_link"}, "pose": {"position": position}},
+    )  # fmt: skip
+
+
+def drive_to(ros: Ros, turn: float, radius: float, height: float) -> dict[str, str]:
+    """Return the heartbeat after a target has been driven to."""
+    episodes = int(ros.heartbeat()["episodes"])
+    give_target(ros, turn, radius, height)
+    ros.wait_until(
+        lambda: int((beat := ros.heartbeat())["episodes"]) > episodes and beat["state"] not in ("running", "hold")
+    )
+    return ros.heartbeat()
+
+
+def get_moving(ros: Ros, side: float) -> None:
+    """Send the arm to one side, from the other, and wait until it is fast."""
+    drive_to(ros, -1.2 * side, 0.5, 0.4)
+    give_target(ros, 1.2 * side)
+    ros.wait_until(lambda: ros.speed() > FAST)
+
+
+def test_policy_reaches_its_targets_through_topics(ros: Ros, sim: Process, node: Process, all_shipped: Path) -> None:
+    node.wait_for("check -> ready")
+    draw = np.random.default_rng(5)
+    outcomes = []
+    for _ in range(TARGETS):
+        beat = drive_to(ros, draw.uniform(-1.0, 1.0), draw.uniform(0.35, 0.6), draw.uniform(0.15, 0.5))
+        outcomes.append(beat["message"])
+    assert outcomes.count("arrived: success") >= len(outcomes) - len(outcomes) // 20, outcomes
+    assert ros.ask("call", service="/rlservo/version")["message"].split()[1] == "1"
+
+    second = start_node(ros, all_shipped, "--name", "second")
+    second.wait_for("commanded by")
+    assert second.end(0) == 2
+    assert "/forward_position_controller/commands" in second.lines[-1]
+    assert ros.heartbeat()["state"] == "arrived"  # the first node goes on
+
+    get_moving(ros, 1.0)
+    began_s = time.time()
+    ros.ask("call", service="/rlservo/hold")
+    assert ros.moved_for(began_s) < 0.4 + BRAKING_S
+    ros.wait_until(lambda: ros.heartbeat()["state"] == "holding")
+    ros.ask("call", service="/rlservo/start")
+    ros.wait_until(lambda: ros.speed() > FAST / 2)
+
+    children = node.children()
+    assert node.end(signal.SIGINT) == 0
+    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
+
+
+def test_late_stamps_and_a_lost_topic_stop_the_arm(ros: Ros, sim: Process, node: Process) -> None:
+    node.wait_for("check -> ready")
+    try:
+        get_moving(ros, 1.0)
+        seen, began_s = len(node.lines), time.time()
+        sim.type("latency 300")  # the states that come are 0.3 s old, and their stamps say so
+        assert ros.moved_for(began_s) < 0.3 + 0.25 + BRAKING_S
+        node.wait_for("fault: the robot's newest state is 0.3", after=seen)
+        sim.type("latency 0")
+
+        get_moving(ros, -1.0)  # a new target connects again
+        seen, began_s = len(node.lines), time.time()
+        sim.type("down")
+        node.wait_for("connection_lost", after=seen)
+        sim.type("up")
+        ros.wait_until(lambda: ros.ask("since", topic="/joint_states", time_s=began_s + 1.0, count=1) != [])
+        assert ros.speed() < FAST / 10
+        get_moving(ros, 1.0)
+    finally:
+        sim.type("latency 0")
+        sim.type("up")
+
+
+def test_killed_processes_leave_a_standing_arm(ros: Ros, sim: Process, node: Process) -> None:
+    node.wait_for("check -> ready")
+    get_moving(ros, 1.0)
+    stream = node.children()[0]
+    began_s = time.time()
+    os.kill(stream, signal.SIGKILL)
+    assert ros.moved_for(began_s) < BRAKING_S
+    node.wait_for("was killed")
+    get_moving(ros, -1.0)  # with a new one
+    stream = node.children()[0]
+    began_s = time.time()
+    node.process.kill()
+    assert ros.moved_for(began_s) < BRAKING_S
+    ros.wait_until(lambda: not Path(f"/proc/{stream}").exists())

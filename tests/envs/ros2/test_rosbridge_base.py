@@ -1,0 +1,220 @@
+"""A base behind a rosbridge, without ROS: the simulated MiR100 and its bridge in a thread, roslibpy as the client."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+from websockets.sync.client import connect
+
+from command_line import rlservo
+from rlservo.envs.robots.arm import RobotError
+from rlservo.envs.robots.command_stream import Phase
+from rlservo.envs.ros2.base import BaseLimits, RosBase
+from rlservo.envs.ros2.rosbridge_server import RosbridgeServer
+from rlservo.envs.ros2.simulated_base import SimulatedBase
+from rlservo.envs.ros2.simulation_loop import run
+from rlservo.envs.ur_controller.server import Link as LinkFaults
+
+PATIENCE_S = 60.0
+TIMEOUT_S = 0.5  # of the base's own drive
+STANDS, FAST = 0.01, 0.2  # [m/s]
+BRAKING_S = 0.8  # from 0.5 m/s, and a busy machine
+
+
+@dataclass
+class RunningBase:
+    """A base that is simulated in a thread of this process."""
+
+    base: SimulatedBase
+    port: int
+    seen: list[tuple[float, float, float]] = field(default_factory=list)  # time.monotonic(), x [m], speed [m/s]
+
+    @property
+    def robot(self) -> str:
+        return f"rosbridge://127.0.0.1:{self.port}"
+
+    @property
+    def faults(self) -> LinkFaults:
+        return self.base.messages.faults
+
+    def watch(self) -> None:
+        self.seen.append((time.monotonic(), self.base.simulation.pose[0], abs(self.base.simulation.velocity[0])))
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        limit = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < limit, "the condition never came true"
+            time.sleep(0.02)
+
+    def moved_for(self, began: float) -> float:
+        """Wait until the base stands, and return for how long it moved on [s]."""
+        self.wait_until(lambda: time.monotonic() > began + 0.2 and self.seen[-1][2] < STANDS)
+        return max((at - began for at, _, speed in self.seen if speed > STANDS and at > began), default=0.0)
+
+
+@pytest.fixture
+def base(request: pytest.FixtureRequest) -> Iterator[RunningBase]:
+    world, is_stamped = getattr(request, "param", ("empty", False))
+    bridge = RosbridgeServer("127.0.0.1", 0)
+    running = RunningBase(SimulatedBase([bridge], world=world, is_stamped=is_stamped, faults=LinkFaults()), bridge.port)
+    tick = running.base.tick
+    running.base.tick = lambda: (tick(), running.watch())[0]  # type: ignore[method-assign]
+    stop, ready = threading.Event(), threading.Event()
+    thread = threading.Thread(target=run, args=(running.base, stop, ready.set), name="simulated-base")
+    thread.start()
+    assert ready.wait(PATIENCE_S)
+    try:
+        yield running
+    finally:
+        stop.set()
+        thread.join()
+        running.base.close()
+
+
+def drive_on(real: RosBase, base: RunningBase, linear: float = 0.5) -> None:
+    """Command a velocity until the base is fast."""
+    limit = time.monotonic() + PATIENCE_S
+    while base.seen[-1][2] < FAST:
+        assert time.monotonic() < limit, real.limited()
+        real.command(linear, 0.0)
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("base", [("empty", True)], indirect=True)
+def test_shipped_policy_drives_through_the_bridge(base: RunningBase, all_shipped: Path, tmp_path: Path) -> None:
+    done = rlservo(
+        "rollout", "rlservo/NoObstacleNavigationMir100Rob-v0", "--bundle", all_shipped / "mir100_navigation",
+        "--env-arg", f"robot={base.robot}", "--episodes", 2, "--seed", 1, "--yes", "--unproven", "--json",
+        "--record", tmp_path / "run.mcap",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert report["successes"] == 2
+    assert "blend_in -> run" in done.stderr  # Twist or TwistStamped was found out
+    assert base.moved_for(time.monotonic()) == 0.0
+
+
+@pytest.mark.parametrize("base", [("lab_6x8", False)], indirect=True)
+def test_obstacle_environment_sees_what_the_simulated_one_sees(base: RunningBase) -> None:
+    env = gym.make(
+        "rlservo.envs:rlservo/ObstacleAvoidanceMir100Rob-v0", robot=base.robot, confirm=False, disable_env_checker=True
+    )
+    try:
+        observation, _ = env.reset(seed=1)
+        beams = env.unwrapped._observed_beams  # type: ignore[attr-defined]
+        assert observation[4:] == pytest.approx(base.base.simulation.scan[beams], abs=0.15)
+        assert env.unwrapped.target_position()[1] < 0.0  # type: ignore[attr-defined]  # on the other side
+        *_, info = env.step(env.action_space.sample() * 0)
+        assert info["robot"]["state"] == "blend_in"
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("base", [("lab_6x8", False)], indirect=True)
+def test_base_stops_before_a_wall_and_may_turn_away(base: RunningBase) -> None:
+    real = RosBase(base.robot, limits=BaseLimits(stop_distance=0.3, blend_s=0.0))
+    try:
+        drive_on(real, base)  # east: the wall's inner face is at x = 2.82
+        began = time.monotonic()
+        while time.monotonic() - began < PATIENCE_S and not (base.seen[-1][2] < STANDS and real.limited()):
+            real.command(0.5, 0.0)
+            time.sleep(0.05)
+        front = base.base.simulation.pose[0] + 0.0376 + 0.45
+        assert 2.82 - 0.5 < front <= 2.82 - 0.3 + 0.02
+        assert real.limited()["stop_distance"] > 0
+        x = base.seen[-1][1]
+        while base.seen[-1][1] > x - 0.1:
+            real.command(-0.3, 0.0)
+            time.sleep(0.05)
+        assert not base.base.simulation.in_collision
+    finally:
+        real.close()
+
+
+def test_silence_of_the_policy_and_a_lost_link_stop_the_base(base: RunningBase) -> None:
+    real = RosBase(base.robot, limits=BaseLimits(blend_s=0.0))
+    try:
+        drive_on(real, base)
+        assert base.moved_for(time.monotonic()) < 0.25 + BRAKING_S
+        assert real.phase == Phase.LATE
+        assert real.limited()["late_setpoint"] >= 1
+
+        drive_on(real, base)
+        base.faults.latency_s = 0.6  # what is seen is old, by its stamps
+        began = time.monotonic()
+        base.wait_until(lambda: (real.command(0.5, 0.0), real.phase == Phase.STALE)[1])
+        base.faults.latency_s = 0.0
+        assert base.moved_for(began) < 0.3 + 0.6 + BRAKING_S
+
+        drive_on(real, base)
+        base.faults.is_down = True
+        assert base.moved_for(time.monotonic()) < TIMEOUT_S + BRAKING_S
+        base.wait_until(lambda: bool(real.fault))
+        assert real.fault.startswith("connection_lost: no odometry on /odom")
+        base.faults.is_down = False
+    finally:
+        real.close()
+
+
+def test_killed_process_leaves_a_standing_base_and_a_second_one_is_refused(base: RunningBase) -> None:
+    program = f"""
+import time
+from rlservo.envs.ros2.base import RosBase
+base = RosBase({base.robot!r})
+while True:
+    base.command(0.5, 0.0)
+    time.sleep(0.05)
+"""
+    process = subprocess.Popen([sys.executable, "-c", program])
+    try:
+        base.wait_until(lambda: bool(base.seen) and base.seen[-1][2] > FAST)
+        with pytest.raises(RobotError, match="/cmd_vel is commanded by another client"):
+            RosBase(base.robot)
+        process.kill()
+        assert base.moved_for(time.monotonic()) < TIMEOUT_S + BRAKING_S
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_dead_mans_switch_must_be_held(base: RunningBase) -> None:
+    real = RosBase(f"{base.robot},deadman=/deadman", limits=BaseLimits(blend_s=0.0, stop_distance=0.0))
+    press = base.base._links[0].advertise("/deadman", "std_msgs/msg/Bool")
+    try:
+        base.wait_until(lambda: (real.command(0.5, 0.0), "deadman_released" in real.limited())[1])
+        assert base.seen[-1][2] < STANDS
+        base.wait_until(lambda: (press({"data": True}), real.command(0.5, 0.0), base.seen[-1][2] > FAST)[2])
+        began = time.monotonic()
+        press({"data": False})
+        base.wait_until(lambda: (real.command(0.5, 0.0), base.seen[-1][2] < STANDS)[1])
+        assert time.monotonic() - began < 0.2 + BRAKING_S
+    finally:
+        real.close()
+
+
+def test_bridge_refuses_what_it_does_not_know_and_goes_on(base: RunningBase) -> None:
+    with connect(f"ws://127.0.0.1:{base.port}", compression=None) as client:
+        for text in ("no JSON", '{"op": "fragment"}', "[]"):
+            client.send(text)
+            assert json.loads(client.recv(PATIENCE_S))["level"] == "error"
+        client.send(json.dumps({"op": "call_service", "service": "/rosapi/nothing", "id": "1"}))
+        assert json.loads(client.recv(PATIENCE_S))["result"] is False
+        client.send('{"op": "publish", "topic": "/cmd_vel", "msg": {}}')
+        client.send(json.dumps({"op": "subscribe", "topic": "/odom"}))
+        assert "pose" in json.loads(client.recv(PATIENCE_S))["msg"]
+
+
+def test_no_bridge_is_one_sentence() -> None:
+    with pytest.raises(
+        RobotError, match=r"no rosbridge answers at 127\.0\.0\.1:1 \(Connection refused\): is the robot"
+    ):
+        RosBase("rosbridge://127.0.0.1:1")

@@ -1,0 +1,165 @@
+"""ROS 2 for tests: the real rclpy in a Python of its own (`.ci/ros` makes it), robots, nodes and a bystander there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PYTHON = ROOT / ".ros" / "bin" / "python"
+PATIENCE_S = 90.0
+STANDS = 0.01  # [rad/s], [m/s]
+
+
+class Process:
+    """A command of rlservo's with the real rclpy; its lines are read as they come."""
+
+    def __init__(self, words: list[str], environment: dict[str, str]) -> None:
+        self.lines: list[str] = []
+        self._rest = b""
+        self.process = subprocess.Popen(
+            [str(PYTHON), *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            env=os.environ | environment, start_new_session=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self.process.stdout, selectors.EVENT_READ)
+
+    def read(self, wait_s: float) -> bool:
+        """Read what has been printed; return whether the output goes on."""
+        if self._selector.select(wait_s):
+            assert self.process.stdout is not None
+            part = os.read(self.process.stdout.fileno(), 65536)
+            *lines, self._rest = (self._rest + part).split(b"\n")
+            self.lines += [line.decode(errors="replace") for line in lines]
+            return bool(part)
+        return True
+
+    def wait_for(self, text: str, after: int = 0) -> str:
+        """Return the first line that holds `text`, `after` so many lines."""
+        limit = time.monotonic() + PATIENCE_S
+        while True:
+            for line in self.lines[after:]:
+                if text in line:
+                    return line
+            assert time.monotonic() < limit, "\n".join([f"{text!r} never came:", *self.lines])
+            goes_on = self.read(0.5)
+            assert goes_on or any(text in line for line in self.lines[after:]), "\n".join(self.lines)
+
+    def type(self, line: str) -> None:
+        """Write a line to its standard input."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"{line}\n".encode())
+        self.process.stdin.flush()
+
+    def children(self) -> list[int]:
+        """Return the processes that it started."""
+        path = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return [int(word) for word in path.read_text().split()]
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """End it by a signal and return its exit code; 0 waits until it ends by itself."""
+        if number and self.process.poll() is None:
+            self.process.send_signal(number)
+        limit = time.monotonic() + PATIENCE_S
+        while self.process.poll() is None:
+            assert time.monotonic() < limit, "\n".join(["it does not end:", *self.lines])
+            self.read(0.2)
+        while self.read(0.0) and self._selector.select(0.0):
+            pass
+        return self.process.returncode
+
+    def close(self) -> None:
+        """End it, whatever became of it."""
+        if self.process.poll() is None:
+            with contextlib.suppress(AssertionError):
+                self.end()
+            self.process.kill()
+            self.process.wait()
+        for stream in (self.process.stdin, self.process.stdout):
+            assert stream is not None
+            with contextlib.suppress(OSError):
+                stream.close()
+        self._selector.close()
+
+
+class Ros:
+    """A graph of its own: nobody else's nodes are in it."""
+
+    def __init__(self) -> None:
+        self.environment = {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_LOCALHOST_ONLY": "1"}
+        self._cleanup = contextlib.ExitStack()
+        self._graph: Process | None = None
+
+    def rlservo(self, *words: object) -> Process:
+        """Start a command of rlservo's."""
+        return self._start("-m", "rlservo.deploy.cli", *map(str, words))
+
+    def close(self) -> None:
+        self._cleanup.close()
+
+    # -- the bystander
+
+    def ask(self, name: str, **arguments: Any) -> Any:
+        """Have the bystander do something; see ros_graph.py."""
+        if self._graph is None:
+            self._graph = self._start(str(ROOT / "tests" / "ros_graph.py"))
+            self._graph.wait_for("ready")
+        seen = len(self._graph.lines)
+        self._graph.type(json.dumps([name, arguments]))
+        answer = json.loads(self._graph.wait_for("", after=seen))
+        assert "error" not in answer, answer["error"]
+        return answer["value"]
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        limit = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < limit, "the condition never came true"
+            time.sleep(0.1)
+
+    def heartbeat(self) -> dict[str, str]:
+        """Return what the next heartbeat says."""
+        began_s, beats = time.time(), []
+        self.wait_until(lambda: beats.extend(self.ask("since", topic="/diagnostics", time_s=began_s)) or bool(beats))
+        status = beats[-1][1]["status"][0]
+        return {"message": status["message"], **{one["key"]: one["value"] for one in status["values"]}}
+
+    def speed(self) -> float:
+        """Return how fast the fastest joint is now [rad/s]."""
+        states = self.ask("since", topic="/joint_states", time_s=0.0, count=1)
+        return max(map(abs, states[-1][1]["velocity"])) if states else 0.0
+
+    def moved_for(self, began_s: float) -> float:
+        """Wait until the arm stands, and return for how long it moved on after a moment [s since 1970]."""
+        self.wait_until(lambda: time.time() > began_s + 0.2 and self.speed() < STANDS)
+        states = self.ask("since", topic="/joint_states", time_s=began_s)
+        fast = [at for at, state in states if max(map(abs, state["velocity"])) > STANDS]
+        return max(fast, default=began_s) - began_s
+
+    def _start(self, *words: str) -> Process:
+        process = Process(list(words), self.environment)
+        self._cleanup.callback(process.close)
+        return process
+
+
+@pytest.fixture(scope="module")
+def ros() -> Iterator[Ros]:
+    """A ROS 2 graph. Skips without the Python that `.ci/ros` makes."""
+    if not PYTHON.exists():
+        assert not os.environ.get("RLSERVO_REQUIRE_ROS"), f"{PYTHON} is missing"
+        pytest.skip("no ROS 2 here: .ci/ros makes a Python with rclpy's wheels, in .ros")
+    graph = Ros()
+    try:
+        yield graph
+    finally:
+        graph.close()

@@ -1,0 +1,110 @@
+"""Another node of the graph, in a process with the real rclpy: a line of JSON asks, a line of JSON answers.
+
+Run by `ros.Graph`; it imports nothing of rlservo's, so that names and types are spelled twice.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+import threading
+import time
+from collections import defaultdict
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+KEPT = 5000  # messages of a topic
+
+
+def interface(kind: str) -> Any:
+    module, _, name = kind.replace("/", ".").rpartition(".")
+    return getattr(importlib.import_module(module), name)
+
+
+def to_plain(value: Any) -> Any:
+    if hasattr(value, "get_fields_and_field_types"):
+        return {name: to_plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+    if isinstance(value, bytes):
+        return list(value)
+    if isinstance(value, str | int | float | bool):
+        return value
+    return [to_plain(one) for one in value]
+
+
+def fill(message: Any, values: dict[str, Any]) -> Any:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            fill(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
+    return message
+
+
+def main() -> None:
+    rclpy.init()
+    node = rclpy.create_node("bystander")
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    threading.Thread(target=executor.spin, daemon=True).start()
+    messages: dict[str, list[tuple[float, Any]]] = defaultdict(list)
+    publishers: dict[str, Any] = {}
+
+    def take(topic: str, message: Any) -> None:
+        messages[topic].append((time.time(), message))
+        del messages[topic][:-KEPT]
+
+    def subscribe(topic: str, kind: str) -> None:
+        qos = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
+        node.create_subscription(interface(kind), topic, lambda message: take(topic, message), qos)
+
+    def publish(topic: str, kind: str, values: dict[str, Any], is_stamped: bool = True, age_s: float = 0.0) -> None:
+        if topic not in publishers:
+            publishers[topic] = node.create_publisher(interface(kind), topic, 1)
+            wait_for_subscriber(topic)
+        message = fill(interface(kind)(), values)
+        if is_stamped and hasattr(message, "header"):
+            made_s = time.time() - age_s
+            message.header.stamp.sec, message.header.stamp.nanosec = int(made_s), int(made_s % 1 * 1e9)
+        publishers[topic].publish(message)
+
+    def wait_for_subscriber(topic: str) -> None:
+        limit = time.monotonic() + 60.0
+        while not node.count_subscribers(topic):
+            assert time.monotonic() < limit, f"nothing subscribes to {topic}"
+            time.sleep(0.05)
+        time.sleep(0.5)  # until it has discovered us too
+
+    def call(service: str) -> Any:
+        kind = interface("std_srvs/srv/Trigger")
+        client = node.create_client(kind, service)
+        assert client.wait_for_service(60.0), f"no service {service}"
+        future = client.call_async(kind.Request())
+        limit = time.monotonic() + 60.0
+        while not future.done():
+            assert time.monotonic() < limit, f"service {service} does not answer"
+            time.sleep(0.01)
+        return to_plain(future.result())
+
+    def since(topic: str, time_s: float, count: int = KEPT) -> Any:
+        return [(at, to_plain(one)) for at, one in messages[topic][-count:] if at >= time_s]
+
+    def types(topic: str) -> Any:
+        return dict(node.get_topic_names_and_types()).get(topic)
+
+    known = {"subscribe": subscribe, "publish": publish, "call": call, "since": since, "types": types}
+    print(json.dumps("ready"), flush=True)
+    for line in sys.stdin:
+        name, arguments = json.loads(line)
+        try:
+            answer = {"value": known[name](**arguments)}
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    main()
