@@ -103,7 +103,13 @@ class Ros:
 
     def rlservo(self, *words: object) -> Process:
         """Start a command of rlservo's."""
-        return self._start("-m", "rlservo.deploy.cli", *map(str, words))
+        return self.python("-m", "rlservo.deploy.cli", *map(str, words))
+
+    def python(self, *words: str) -> Process:
+        """Start a Python that has rclpy."""
+        process = Process(list(words), self.environment)
+        self._cleanup.callback(process.close)
+        return process
 
     def close(self) -> None:
         self._cleanup.close()
@@ -113,7 +119,7 @@ class Ros:
     def ask(self, name: str, **arguments: Any) -> Any:
         """Have the bystander do something; see ros_graph.py."""
         if self._graph is None:
-            self._graph = self._start(str(ROOT / "tests" / "ros_graph.py"))
+            self._graph = self.python(str(ROOT / "tests" / "ros_graph.py"))
             self._graph.wait_for("ready")
         seen = len(self._graph.lines)
         self._graph.type(json.dumps([name, arguments]))
@@ -143,13 +149,8 @@ class Ros:
         """Wait until the arm stands, and return for how long it moved on after a moment [s since 1970]."""
         self.wait_until(lambda: time.time() > began_s + 0.2 and self.speed() < STANDS)
         states = self.ask("since", topic="/joint_states", time_s=began_s)
-        fast = [at for at, state in states if max(map(abs, state["velocity"])) > STANDS]
-        return max(fast, default=began_s) - began_s
-
-    def _start(self, *words: str) -> Process:
-        process = Process(list(words), self.environment)
-        self._cleanup.callback(process.close)
-        return process
+        fast = [state["header"]["stamp"] for _, state in states if max(map(abs, state["velocity"])) > STANDS]
+        return max((at["sec"] + at["nanosec"] * 1e-9 for at in fast), default=began_s) - began_s
 
 
 @pytest.fixture(scope="module")

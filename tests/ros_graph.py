@@ -51,7 +51,7 @@ def main() -> None:
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
     messages: dict[str, list[tuple[float, Any]]] = defaultdict(list)
-    publishers: dict[str, Any] = {}
+    made: dict[str, Any] = {}
 
     def take(topic: str, message: Any) -> None:
         messages[topic].append((time.time(), message))
@@ -62,14 +62,14 @@ def main() -> None:
         node.create_subscription(interface(kind), topic, lambda message: take(topic, message), qos)
 
     def publish(topic: str, kind: str, values: dict[str, Any], is_stamped: bool = True, age_s: float = 0.0) -> None:
-        if topic not in publishers:
-            publishers[topic] = node.create_publisher(interface(kind), topic, 1)
+        if topic not in made:
+            made[topic] = node.create_publisher(interface(kind), topic, 1)
             wait_for_subscriber(topic)
         message = fill(interface(kind)(), values)
         if is_stamped and hasattr(message, "header"):
             made_s = time.time() - age_s
             message.header.stamp.sec, message.header.stamp.nanosec = int(made_s), int(made_s % 1 * 1e9)
-        publishers[topic].publish(message)
+        made[topic].publish(message)
 
     def wait_for_subscriber(topic: str) -> None:
         limit = time.monotonic() + 60.0
@@ -92,10 +92,10 @@ def main() -> None:
     def since(topic: str, time_s: float, count: int = KEPT) -> Any:
         return [(at, to_plain(one)) for at, one in messages[topic][-count:] if at >= time_s]
 
-    def types(topic: str) -> Any:
-        return dict(node.get_topic_names_and_types()).get(topic)
+    def publishers(topic: str) -> Any:
+        return [one.node_name for one in node.get_publishers_info_by_topic(topic)]
 
-    known = {"subscribe": subscribe, "publish": publish, "call": call, "since": since, "types": types}
+    known = {"subscribe": subscribe, "publish": publish, "call": call, "since": since, "publishers": publishers}
     print(json.dumps("ready"), flush=True)
     for line in sys.stdin:
         name, arguments = json.loads(line)

@@ -41,6 +41,12 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "publish {bundle} s3://127.0.0.1/bucket": ("remote",),
     "cockpit --robot-server 127.0.0.1:1": ("cockpit",),
     "rollout rlservo/EndEffectorPositioningURRob-v0 --bundle {bundle} --env-arg robot=rtde://127.0.0.1": ("ur", "sim"),
+    "rollout rlservo/NoObstacleNavigationMir100Rob-v0 --bundle {bundle} --env-arg robot=rosbridge://127.0.0.1": (
+        "rosbridge",
+        "sim",
+    ),
+    "ros2 --bundle {bundle}": ("sim",),
+    "ros2-sim ur5": ("sim",),
     "robot-latency rtde://127.0.0.1 --yes": ("ur", "sim"),
     "ur-controller --host 203.0.113.7": ("sim",),
     "server-manager --host 203.0.113.7": ("sim",),

@@ -36,6 +36,7 @@ RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of comma
 RUNNING = 7
 # Distance of a joint from its setpoint beyond which it does not follow: at rest, and so much of its velocity more.
 FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
+AHEAD_S = 0.1  # of a trajectory's point: its controller begins each new one where the arm is, which lags
 DRIFT_GAIN = 2.0  # [1/s], of velocity commands
 KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTORY}
 
@@ -169,9 +170,8 @@ class RosArmConnection:
 
     def _trajectory(self, goal: Vector, velocity: Vector) -> dict[str, Any]:
         """Return two points: the setpoint, and from there a stop, which is the end if no other trajectory comes."""
-        period_s = 1.0 / self.rate_hz
         stop_s = float(np.abs(velocity).max()) / self._limits.acceleration
-        points: list[tuple[float, Vector, Vector]] = [(2.0 * period_s, goal + velocity * period_s, velocity)]
+        points: list[tuple[float, Vector, Vector]] = [(AHEAD_S, goal + velocity * AHEAD_S, velocity)]
         if stop_s > 0.0:
             at = points[0]
             points.append((at[0] + stop_s, at[1] + velocity * stop_s / 2.0, np.zeros(6)))

@@ -65,7 +65,7 @@ class BaseLimits:
     speed_scale: float = 1.0  # of both velocities; a first run takes 0.2
     acceleration: float = 1.5  # [m/s^2], also to stop
     angular_acceleration: float = MAX_ANGULAR_ACCELERATION  # [rad/s^2]
-    stop_distance: float = 0.05  # [m], of the body from what a scan sees; 0: no look at the scan
+    stop_distance: float = 0.1  # [m], of the body from what a scan sees; 0: no look at the scan
     blend_s: float = 0.5  # [s], in which the policy's share of the speed grows from 0 to 1
 
     def __post_init__(self) -> None:

@@ -94,7 +94,7 @@ class MirroredMir100(Mir100Simulation):
         """Decelerate and stand."""
         self._base.hold()
 
-    def advance(self, cycles: int = 0) -> None:  # noqa: ARG002
+    def advance(self, substeps: int = 0) -> None:  # noqa: ARG002
         """Wait for the end of the control cycle and look at the base."""
         now = time.monotonic()
         self._due_s = max(self._due_s + CYCLE_S, now)  # a cycle that was missed is not caught up

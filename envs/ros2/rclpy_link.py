@@ -13,6 +13,7 @@ from typing import Any
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.link import Endpoint, Publish, safely
 
+GUARD = "rlservo_guard"  # publishes zeros alone, when its own commander has fallen silent
 ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, for the processes that we start too
 
 
@@ -22,9 +23,9 @@ class RclpyLink:
     def __init__(self, name: str, *, is_unique: bool = False) -> None:
         """Raise RobotError without rclpy. `is_unique`: the name is used as it is, else our process id follows it."""
         try:
-            import rclpy
-            from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-            from rclpy.signals import SignalHandlerOptions
+            import rclpy  # pyright: ignore[reportMissingImports]
+            from rclpy import executors  # pyright: ignore[reportMissingImports]
+            from rclpy.signals import SignalHandlerOptions  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise RobotError(
                 f"ROS 2's rclpy cannot be imported ({error}): source /opt/ros/DISTRIBUTION/setup.bash, with the Python "
@@ -41,11 +42,11 @@ class RclpyLink:
             name if is_unique else f"{name}_{os.getpid()}", context=self._context,
             automatically_declare_parameters_from_overrides=is_unique,
         )  # fmt: skip
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 
         def spin() -> None:
-            with contextlib.suppress(ExternalShutdownException):
+            with contextlib.suppress(executors.ExternalShutdownException):
                 self._executor.spin()
 
         self._thread = threading.Thread(target=spin, name="ros", daemon=True)
@@ -84,8 +85,8 @@ class RclpyLink:
         return self._others(self.node.get_publishers_info_by_topic(topic))
 
     def rivals(self, topic: str) -> list[Endpoint]:
-        """Return the publishers of other nodes: a robot obeys one."""
-        return self.publishers(topic)
+        """Return the publishers of other nodes: a robot obeys one. A guard is none."""
+        return [one for one in self.publishers(topic) if not one.node.rpartition("/")[2].startswith(GUARD)]
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         """Return the subscribers of other nodes."""
@@ -108,11 +109,11 @@ class RclpyLink:
 
     @staticmethod
     def _qos(is_kept: bool, is_reliable: bool) -> Any:
-        from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+        from rclpy import qos  # pyright: ignore[reportMissingImports]
 
-        reliable, best = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
-        durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if is_kept else QoSDurabilityPolicy.VOLATILE
-        return QoSProfile(depth=1, reliability=reliable if is_reliable or is_kept else best, durability=durability)
+        reliable, best = qos.QoSReliabilityPolicy.RELIABLE, qos.QoSReliabilityPolicy.BEST_EFFORT
+        durability = qos.QoSDurabilityPolicy.TRANSIENT_LOCAL if is_kept else qos.QoSDurabilityPolicy.VOLATILE
+        return qos.QoSProfile(depth=1, reliability=reliable if is_reliable or is_kept else best, durability=durability)
 
 
 @functools.cache

@@ -11,7 +11,7 @@ import signal
 import sys
 
 from rlservo.envs.ros2.messages import NUMBERS
-from rlservo.envs.ros2.rclpy_link import RclpyLink
+from rlservo.envs.ros2.rclpy_link import GUARD, RclpyLink
 
 SILENCE_S = 0.1
 SETTLE_S = 0.5  # in which the last zeros reach the controller
@@ -20,18 +20,16 @@ SETTLE_S = 0.5  # in which the last zeros reach the controller
 def main(topic: str) -> None:
     """Guard a topic until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    link = RclpyLink("rlservo_guard")
-    publish, is_fed = None, False
+    link = RclpyLink(GUARD)
+    publish, is_fed = link.advertise(topic, NUMBERS), False  # now: a subscriber takes a while to find it
     while True:
         ready, _, _ = select.select([0], [], [], SILENCE_S)
         if ready and not os.read(0, 4096):
             break
         is_fed = is_fed or bool(ready)
-        if not ready and is_fed:
-            publish = publish or link.advertise(topic, NUMBERS)
+        if is_fed and not ready:
             publish({"data": [0.0] * 6})
     for _ in range(int(SETTLE_S / SILENCE_S) if is_fed else 0):  # else the topic may be another node's
-        publish = publish or link.advertise(topic, NUMBERS)
         publish({"data": [0.0] * 6})
         select.select([], [], [], SILENCE_S)
     link.close()

@@ -14,10 +14,10 @@ import pytest
 
 from ros import Process, Ros
 
-TARGETS = int(os.environ.get("RLSERVO_ROS_TARGETS", "4"))
+TARGETS = int(os.environ.get("RLSERVO_ROS_TARGETS", "3"))
 PREFIX = "left_"
 FAST = 0.2  # [rad/s]
-BRAKING_S = 0.6  # at 5 rad/s^2, servoj's lag and a busy machine
+BRAKING_S = 1.0  # at 5 rad/s^2, servoj's lag and a busy machine
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,50 @@
+"""Velocity commands and trajectories, whose processes are killed while the arm moves."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from ros import Ros
+
+BRAKING_S = 2.0  # the guard's 0.1 s of silence, braking, and a busy machine; without a guard it never stops
+PROGRAM = """
+import sys, time
+import numpy as np
+from rlservo.envs.robots.limits import Limits
+from rlservo.envs.robots.rtde_arm import RtdeArm
+arm = RtdeArm("ros2:command=" + sys.argv[1], "ur5", velocity_scale=0.2, limits=Limits.of({"blend_s": 0.1}))
+print("stream", arm.pid, flush=True)
+start = arm.arm_state().positions
+while not arm.fault():
+    side = 1.0 if time.monotonic() % 4.0 < 2.0 else -1.0
+    arm.command(start + np.array([side * 3.0, 0, 0, 0, 0, 0]), 3.0)
+    time.sleep(0.05)
+print("fault", arm.fault(), flush=True)
+arm.close()
+"""
+
+
+@pytest.mark.parametrize("how", ["velocity", "trajectory"])
+def test_killed_stream_leaves_a_standing_arm_with(how: str, ros: Ros) -> None:
+    sim = ros.rlservo("ros2-sim", "ur5", "--controller", how)
+    sim.wait_for(f"{how} controller")
+    ros.wait_until(lambda: len(ros.ask("publishers", topic="/joint_states")) == 1)  # the one before is gone
+    ros.ask("subscribe", topic="/joint_states", kind="sensor_msgs/msg/JointState")
+    driver = ros.python("-c", PROGRAM, how)
+    stream = int(driver.wait_for("stream").split()[1])
+    helpers = [int(pid) for pid in Path(f"/proc/{stream}/task/{stream}/children").read_text().split()]
+    assert len(helpers) == (1 if how == "velocity" else 0)
+    ros.wait_until(lambda: ros.speed() > 0.3)
+    began_s = time.time()
+    os.kill(stream, signal.SIGKILL)
+    assert ros.moved_for(began_s) < BRAKING_S
+    driver.wait_for("was killed")
+    assert driver.end(0) == 0
+    ros.wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in helpers))
+    assert sim.end() == 0
+    assert not [line for line in sim.lines if "protective" in line or "rejected" in line]
