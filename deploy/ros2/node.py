@@ -221,10 +221,17 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
             node.counts["late"] += 1
             robot.simulation.hold()
             return number - 1
-        observation, _, terminated, truncated, info = env.step(action)
+        observation, reward, terminated, truncated, info = env.step(action)
         node.counts["decisions"] += 1
+        is_over = terminated or truncated
+        if report := getattr(policy, "outcome", None):  # of a recording, or a server that counts
+            policy.robot = info["robot"]  # type: ignore[attr-defined]  # a recording's, nobody's else
+            report(
+                float(reward), terminated=terminated, truncated=truncated, final_status=info.get("final_status"),
+                final_obs=observation if is_over else None,
+            )  # fmt: skip
         node.enter("running" if info["robot"]["state"] in ("run", "blend_in") else info["robot"]["state"])
-        if terminated or truncated:
+        if is_over:
             robot.simulation.hold()
             status = info["final_status"]
             node.counts["successes"] += bool(info["is_success"])
