@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -123,6 +124,8 @@ def test_ros_2_finds_the_package_its_executable_and_launch_file(ros: Ros, wheel:
     """`ros2 run` and `ros2 launch` look for these places; the tools themselves are no packages of PyPI's."""
     prefix = tmp_path / "environment"
     environment_with(wheel, prefix)
+    pip = [sys.executable, "-m", "pip", "--python", str(prefix / "bin" / "python"), "install", "-q"]
+    subprocess.run([*pip, "--no-deps", "--no-index", "--force-reinstall", str(wheel)], check=True, timeout=300)
     program = (
         "from ament_index_python.packages import get_package_prefix, get_package_share_directory as share; "
         "print(get_package_prefix('rlservo'), share('rlservo'))"
