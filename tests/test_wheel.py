@@ -20,7 +20,9 @@ def test_wheel_holds_every_module_and_asset_and_no_foreign_top_level(wheel: Path
         names = set(archive.namelist())
     top_level = {name.split("/")[0] for name in names}
     info = next(name for name in top_level if name.endswith(".dist-info"))
-    assert top_level == {"rlservo", info}
+    data = info.replace(".dist-info", ".data")  # what ros2 run looks for
+    assert top_level == {"rlservo", info, data}
+    assert {name.split("/")[2] for name in names if name.startswith(data)} == {"lib", "share"}
     for folder in FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             if path.match("kuberay/secrets*.yaml") and path.name != "secrets.example.yaml":
@@ -35,7 +37,10 @@ def test_metadata_installs_no_developers_tools_and_has_no_placeholder(wheel: Pat
         text = archive.read(next(name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))).decode()
     head, _, readme = text.partition("\n\n")
     (everything,) = [line for line in head.splitlines() if line.endswith('extra == "all"')]
-    assert everything == 'Requires-Dist: rlservo[client,cockpit,ray,record,remote,serve,sim,train,ur]; extra == "all"'
+    assert (
+        everything
+        == 'Requires-Dist: rlservo[client,cockpit,ray,record,remote,rosbridge,serve,sim,train,ur]; extra == "all"'
+    )
     assert "<this repository>" not in readme
 
 

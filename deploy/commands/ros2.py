@@ -57,7 +57,7 @@ def ros2(
         list[str] | None, typer.Argument(metavar="--ros-args ...", help="Remappings and parameters, as for any node.")
     ] = None,
 ) -> None:
-    """Be a ROS 2 node that drives a robot with a policy, until Ctrl-C.
+    """Drive a robot as a ROS 2 node until Ctrl-C.
 
     A policy of one of our environments drives its robot to each pose on ~/target. Any other policy's observation and
     action elements are fields of messages, by their names or by --mapping. Services: ~/start, ~/hold, ~/stop,
@@ -111,7 +111,9 @@ def ros2_sim(
     ] = None,
     ros: Annotated[bool, typer.Option("--ros/--no-ros", help="Base: join the ROS 2 graph.")] = True,
 ) -> None:
-    """Be a simulated robot with a real one's topics, until Ctrl-C. Lines on standard input stop it or cut the link.
+    """Offer a simulated robot's ROS 2 topics until Ctrl-C.
+
+    Lines on standard input stop it, move it or cut the link (`help` lists them).
 
     Example: `rlservo ros2-sim ur5e`, or without ROS `rlservo ros2-sim mir100 --no-ros --rosbridge-port 9090`
     """

@@ -70,8 +70,12 @@ class RosArmConnection:
             topic = address["commands"] or COMMAND_TOPICS[self._how]
             if self._how == "velocity":  # its controller repeats the last command without an end
                 words = [sys.executable, "-m", "rlservo.envs.ros2.velocity_guard", topic]
-                self._guard = subprocess.Popen(words, stdin=subprocess.PIPE, start_new_session=True)
+                self._guard = subprocess.Popen(
+                    words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+                )
             self._publish = take_command(self._link, topic, KINDS[self._how])
+            if self._guard is not None and self._guard.stdout is not None and not self._guard.stdout.readline():
+                raise RobotError(f"the guard of {topic} ended before it could guard: nothing is commanded without it")
         except BaseException:
             self.close()
             raise

@@ -9,10 +9,14 @@ import os
 import select
 import signal
 import sys
+import time
 
+from rlservo.envs.ros2.link import wait_until
 from rlservo.envs.ros2.messages import NUMBERS
 from rlservo.envs.ros2.rclpy_link import GUARD, RclpyLink
 
+READY = b"ready\n"  # on standard output: from now on it guards
+FIND_S = 20.0
 SILENCE_S = 0.1
 SETTLE_S = 0.5  # in which the last zeros reach the controller
 
@@ -22,6 +26,9 @@ def main(topic: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     link = RclpyLink(GUARD)
     publish, is_fed = link.advertise(topic, NUMBERS), False  # now: a subscriber takes a while to find it
+    wait_until(lambda: bool(link.subscribers(topic)), f"nothing subscribes to {topic}", FIND_S)
+    time.sleep(SETTLE_S)
+    os.write(1, READY)
     while True:
         ready, _, _ = select.select([0], [], [], SILENCE_S)
         if ready and not os.read(0, 4096):
