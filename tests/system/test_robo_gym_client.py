@@ -111,7 +111,7 @@ def run_each(
 @pytest.mark.parametrize(
     ("task", "episodes", "expected"),
     [
-        ("EndEffectorPositioningUR", 100, 95),
+        ("EndEffectorPositioningUR", 30, 27),
         ("NoObstacleNavigationMir100", 20, 18),
         # 93.8 % over 500 episodes: fewer than 13 of 20 come once in seventy thousand times.
         ("ObstacleAvoidanceMir100", 20, 13),
