@@ -12,7 +12,6 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.terminal import Json, note, print_json
-from rlservo.export.contract.contract import REWARD_PATTERN
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra
 
@@ -73,6 +72,8 @@ def export(
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
     start = time.perf_counter()
+    from rlservo.export.contract.contract import REWARD_PATTERN  # not for `--help`
+
     if re.fullmatch(REWARD_PATTERN, reward) is None:
         raise UsageError(f"--reward {reward[:80]!r}: expected MODULE:FUNCTION, such as my_rewards:reach")
     if all_modules and (module_id is not None or agent_id is not None):

@@ -54,5 +54,5 @@ def host_of(robot: str) -> str | None:
         return robot
     host = robot.removeprefix(RTDE)
     if robot == host or not host or "/" in host or ":" in host:
-        raise RobotError(f"robot {robot!r}: expected '{MUJOCO}', '{RTDE}HOST' ('{RTDE}192.168.0.2' say) or '{ROS2}'")
+        raise RobotError(f"robot {robot!r}: expected '{MUJOCO}', '{RTDE}HOST' or '{ROS2}'")
     return host

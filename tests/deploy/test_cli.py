@@ -187,7 +187,7 @@ def test_verify_finds_c_that_ends_otherwise(policies: Path, compiled: Path, tmp_
     about["files"]["libur5.so"] = hashlib.sha256((copy / "libur5.so").read_bytes()).hexdigest()
     (copy / "compile.json").write_text(json.dumps(about))
     done = rlservo_here("verify", policies, "--compiled", copy, *REACH)
-    refused(done, 1, "episode 0 (seed 0) ends otherwise: with the bundle 'success' after ", "with its C '")
+    refused(done, 1, "episode 0 (seed 0) ends differently: with the bundle 'success' after ", "with its C '")
 
 
 def test_rollout_replay_and_the_cockpit_drive_the_compiled_policy(compiled: Path, tmp_path: Path) -> None:

@@ -96,5 +96,5 @@ def test_wrong_limit_is_named(values: dict[str, object], words: str) -> None:
 
 @pytest.mark.parametrize("robot", ["rtde://", "192.168.0.2", "rtde://a/b", "rtde://a:30004", "ros://a"])
 def test_wrong_robot_is_named(robot: str) -> None:
-    with pytest.raises(RobotError, match="expected 'mujoco' or 'rtde://HOST'"):
+    with pytest.raises(RobotError, match="expected 'mujoco', 'rtde://HOST' or 'ros2:'"):
         host_of(robot)
