@@ -8,6 +8,7 @@ robot's programmer got wrong.
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable
 from typing import Annotated, Any
 
@@ -275,8 +276,7 @@ def _endpoint(route: Route, body: Any) -> Callable[..., Any]:
 
     async def endpoint(**_given: Any) -> None: ...
 
-    names = [name for name in ("name", "version") if f"{{{name}}}" in route.path]
-    kinds: dict[str, Any] = dict.fromkeys(names, str)
+    kinds: dict[str, Any] = dict.fromkeys(re.findall(r"{(\w+)}", route.path), str)
     if body is not None:
         kinds["request"] = Annotated[body, Body()]
     parameters = [

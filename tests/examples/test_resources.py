@@ -44,7 +44,7 @@ def test_a_process_must_fit_one_machine(scripts: Any) -> None:
     check([node(1)] * 5, room("the cluster", (node(2), node(3))))
     check([node(0.5)] * 2 + [node(1)], room("the cluster", (node(2),)))
     with pytest.raises(
-        Exception, match=r"6 CPUs asked for \(6 processes with 1 CPU each\); the cluster has 5 CPUs: go"
+        Exception, match=r"6 CPUs asked for \(6 processes with 1 CPU each\); the cluster has 5 CPUs: resume on"
     ):
         check([node(1)] * 6, room("the cluster", (node(2), node(3))))
     with pytest.raises(

@@ -212,7 +212,7 @@ def test_missing_policy_server_policy_or_room_is_one_sentence_and_leaves_nothing
         assert manager.servers.running == {}  # the manager has room for one: the third found it free
         manager.servers.start("roslaunch mir100_robot_server sim_robot_server.launch")
         done = run(robo_gym_python, light_client, *to, "--url", url)
-        assert_sentence(done, 1, "could not be started: Failed 10 tentatives .* log of the server manager .* says why")
+        assert_sentence(done, 1, "could not be started: Failed 10 tentatives .* see the log of the server manager")
         assert len(manager.servers.running) == 1
     finally:
         manager.close()

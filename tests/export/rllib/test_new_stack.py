@@ -390,7 +390,7 @@ def test_a_state_that_does_not_fit_is_refused_by_name(
 def test_a_policy_that_sees_rewards_asks_for_them(export: Callable[[str], ExportResult]) -> None:
     policy = Policy.load(export("previous").path)
     policy.act(2)  # an episode's first step has no reward
-    with pytest.raises(RequestError, match="give act"):
+    with pytest.raises(RequestError, match=r"pass act\(obs, reward"):
         policy.act(2)
     policy.act(2, reward=0.5)
     with pytest.raises(RequestError, match="1 finite reward"):
