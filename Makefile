@@ -9,8 +9,8 @@ PIP_QUIET := $(if $(MAKE_TERMOUT),,-qq)
 # not wait for time to pass.
 UNITS := tests/serve_app tests/envs/test_registration.py tests/export/checkpoints/test_experiment.py \
 	tests/test_layout.py tests/test_package.py tests/test_private_names.py
-NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py replay \
-	repository/test_remote_repository.py)
+NOT_UNITS := $(addprefix --ignore=tests/serve_app/, engines client/test_bad_line.py client/test_client_faults.py learning \
+	replay repository/test_remote_repository.py)
 
 # The extras without gigabytes; the cockpit's viser limits websockets and rich to old releases.
 ENDS_EXTRAS := client,serve,sim,record,remote

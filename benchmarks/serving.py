@@ -25,6 +25,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -257,8 +258,7 @@ def ratio(rows: list[Row], name: str, key: str) -> float | None:
 def report(rows: list[Row]) -> str:
     """Return the tables, in Markdown."""
     lines = [
-        "| server | first answer, s | memory, MB | 1 connection, ms | 16, req/s | 16 x 50 Hz, ms | 64 x 20 Hz, ms "
-        "| WebSocket, ms | rounds |",
+        "| server | first | memory | 1 | 16 | 16 x 50 Hz | 64 x 20 Hz | WebSocket | rounds |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name in MAKERS:
@@ -309,15 +309,14 @@ def shown(rows: list[Row], key: str, form: str) -> str:
 def heading(loads: list[float]) -> str:
     """Return the published page's introduction."""
     busy = f"load average {loads[0]:.1f} before the start"
-    return f"""# Serving speed
-
-`python benchmarks/serving.py --install`, then `python benchmarks/serving.py --publish`, on a quiet machine: this page.
-{os.cpu_count()} cores ({processor()}), Python {platform.python_version()}, {busy}; client and server share the cores.
-The policy: `examples/checkpoints/{POLICY}`; a request: one observation as JSON. Medians of the rounds; of robots p50,
-p99, p99.9. Memory is resident, of all processes; in brackets what they share is counted once. The two peers with "bare"
-in their name check nothing: they are what serving costs at least.
-
-"""
+    text = f"""
+        `python benchmarks/serving.py --install`, then `--publish`, on a quiet machine: this page.
+        {os.cpu_count()} cores ({processor()}), Python {platform.python_version()}, {busy}; client and server share the
+        cores. A request is one observation as JSON, the policy `examples/checkpoints/{POLICY}`. Medians of the rounds:
+        the first answer [s], resident memory of all processes [MB] (in brackets with what they share counted once),
+        1 connection [ms], 16 connections [requests/s], 16 robots at 50 Hz, 64 at 20 Hz (p50, p99, p99.9 [ms]), a
+        WebSocket [ms]. The two peers with "bare" in their name check nothing: they are what serving costs at least."""
+    return "# Serving speed\n\n" + textwrap.fill(" ".join(text.split()), 118, break_on_hyphens=False) + "\n\n"
 
 
 def processor() -> str:

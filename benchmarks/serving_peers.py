@@ -172,7 +172,7 @@ MAKERS: dict[str, Make] = {
     "Ray Serve defaults": lambda case, port, folder: _on_ray(
         "ray_serve_defaults.py", case.onnx, port, folder, is_plain=True, rounds=1
     ),
-    "RLlib's Ray Serve example": lambda case, port, folder: _on_ray(
+    "RLlib's Serve example": lambda case, port, folder: _on_ray(
         "rllib_example.py", case.checkpoint, port, folder, is_plain=True, rounds=1, path="/rllib-rlmodule",
         key="observation", checks=False,
     ),

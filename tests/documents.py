@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(
     r"^(<!-- not run: [^\n]+ -->\n)?( *)(?:<!-- not run: ([^\n]+) -->\n *)?```(\w+)\n(.*?)^ *```$", re.M | re.S
 )
-STAYS = re.compile(r"^rlservo (serve|cockpit|server-manager|robot-server)\b")  # until Ctrl-C
+STAYS = re.compile(r"^(\w+=\S+ )*rlservo (serve|cockpit|server-manager|robot-server)\b")  # until Ctrl-C
 NOT_HERE = re.compile(r"^(pip install|make) ")  # tests/test_wheel.py installs, tests/system/test_demo.py makes
 PORTS = ("8000", "8080", "8090", "6379")
 PATIENCE_S = 300.0
@@ -97,10 +97,10 @@ class Shell:
         lines = [line for line in block.text.splitlines(keepends=True) if not NOT_HERE.match(line)]
         if not lines or not STAYS.match(lines[-1]):
             return self._finish("".join(lines))
-        out = self._finish("".join(lines[:-1]))
         self.stop()
+        out = self._finish("".join(lines[:-1]))  # what it leaves running, a Redis say, runs beside the server
         port = self.ports["8090" if "cockpit" in lines[-1] else "8000"]
-        server = self._start(f"exec {lines[-1].split('#')[0].strip()} --port {port}", "server")
+        server = self._start(f"exec env {lines[-1].split('#')[0].strip()} --port {port}", "server")
         deadline = time.monotonic() + PATIENCE_S
         while True:
             with suppress(OSError), socket.create_connection(("127.0.0.1", int(port)), timeout=1.0):
