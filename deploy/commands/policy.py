@@ -218,7 +218,7 @@ def _give(
 
 def _table(replica: dict[str, Any]) -> Table:
     table = _columns(
-        f"process {replica['replica']}, plan {replica['generation']} ({replica['changed_by']})",
+        f"process {replica['replica'] or 'of the server'}, plan {replica['generation']} ({replica['changed_by']})",
         *("policy", "version", "state", "aliases", "since (UTC)", "requests", "reason"),
     )
     for each in replica["policies"]:

@@ -13,7 +13,8 @@ from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.wire.asgi import ASGIApp
 
-GET, POST, WEBSOCKET = "GET", "POST", "WEBSOCKET"
+GET, POST = "GET", "POST"
+WEBSOCKET = "WebSocket:"  # no method that a client can send: they have no colon
 PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 PARAMETER = re.compile(r"\\{(\w+)\\}")  # in an escaped path
 

@@ -30,7 +30,7 @@ from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 logger = logging.getLogger(__name__)
 
 SUFFIX = ".mcap"
-FILE_NAME = re.compile(r"^rlservo-[0-9]{8}T[0-9]{6}-.+-[0-9]+-[0-9]+\.mcap$")
+FILE_NAME = re.compile(r"^rlservo-[0-9]{8}T[0-9]{6}-[^/\n]+-[0-9]+-[0-9]+\.mcap\Z")
 MIB = 1024 * 1024
 BUFFER_RECORDS = 20_000
 BUFFER_BYTES = 64 * MIB

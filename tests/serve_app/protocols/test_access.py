@@ -5,6 +5,7 @@ A path that a check reads differently from the router is a way around the check,
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
@@ -315,6 +316,24 @@ def test_other_methods_of_a_path_are_kept_as_its_own_is(server: Served) -> None:
                     assert status == 401, shown
                 else:
                     assert status < 500, shown
+
+
+def test_no_method_of_http_leads_to_a_stream(app: PolicyApp) -> None:
+    sent: list[Any] = []
+
+    async def ask(method: str) -> int:
+        async def receive() -> Any:
+            return {"type": "http.request", "body": b"", "more_body": False}
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        scope = {"type": "http", "method": method, "path": "/v1/policies/ur5/stream", "headers": [], "client": None}
+        await app(scope, receive, send)
+        return int(sent[-2]["status"])
+
+    # h11, which another server may parse with, takes any word for a method.
+    assert [asyncio.run(ask(method)) for method in ("WEBSOCKET", "websocket", "GET")] == [404] * 3
 
 
 def test_a_path_that_is_not_there_wants_a_key_first(server: Served) -> None:
