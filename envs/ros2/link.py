@@ -12,7 +12,9 @@ from rlservo.envs.ros2.address import RosAddress
 
 SAID_AFTER_S = 10.0
 LOOK_S = 0.02
-DISCOVERY_S = 1.0  # in which a second node that commands the same robot is noticed
+# In which every node of the graph is discovered: Fast DDS repeats its announcements every 3 s, and one may be lost.
+DISCOVERY_S = 4.0
+LEAVING_S = 1.0  # in which a node that ends is gone from the graph, or the name of a new one is known
 
 Publish = Callable[[Mapping[str, Any]], None]
 log = logging.getLogger("rlservo.robot")
@@ -88,7 +90,7 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
     def refuse() -> None:
         if not link.rivals(topic):
             return
-        time.sleep(DISCOVERY_S)  # one that is just leaving, or whose name is not known yet
+        time.sleep(LEAVING_S)
         if others := link.rivals(topic):
             names = ", ".join(sorted({one.node for one in others}))
             raise RobotError(f"{topic} is commanded by {names} already: end it first, a robot obeys one node")
