@@ -91,7 +91,8 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "minari": ("serve_app/recording/minari_export.py",),
     "httpx": (),
     "httpcore": (
-        "serve_app/client/http_transport.py", "serve_app/repository/storage_http.py", "serve_app/wire/bounded_http.py",
+        "serve_app/client/http_transport.py", "serve_app/repository/object_storage.py",
+        "serve_app/wire/bounded_http.py",
     ),
     "websockets": (
         "deploy/cockpit/page.py", "envs/ros2/rosbridge_server.py", "serve_app/client/websocket_connection.py",

@@ -35,7 +35,7 @@ from rlservo.serve_app.engines.http_bounds import (
 )
 from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.serving import Serving
-from rlservo.serve_app.repository.object_storage import place_of
+from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
 from rlservo.serve_app.server.logs import configure

@@ -25,7 +25,7 @@ from rlservo.serve_app.engines.serving import Serving
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY
-from rlservo.serve_app.repository.object_storage import place_of
+from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.settings import ServerSettings

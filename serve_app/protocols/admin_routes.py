@@ -23,11 +23,11 @@ from rlservo.serve_app.versions.serving_plan import Plan
 def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
     """Return the routes of /v1/admin, and the repository extension's load and unload."""
 
-    async def carry_out(call: Call, command: str, given: Command) -> Plan:
+    async def carry_out(call: Call, command: Command) -> Plan:
         name, entry = call.params["name"], call.audit
-        what = f"{command} {name} {given.words()}".strip()
-        entry.command, entry.policy, entry.change, entry.version = command, name, what, given.version
-        after = await given.give(control, name, what)
+        entry.command, entry.policy, entry.change = command.verb, name, command.line(name)
+        entry.version = getattr(command, "version", None)
+        after = await control.give(command, name)
         entry.code, entry.generation = OK, after.generation
         return after
 
@@ -38,7 +38,7 @@ def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
         async def answer(call: Call) -> tuple[bytes, Headers]:
             check_media_type(call.headers, JSON)
             document, _ = parse_json(call.body, such_as='{"version": "2"}')
-            after = await carry_out(call, command, parse(command, document))
+            after = await carry_out(call, parse(command, document))
             return Changed.of(after, call.params["name"]).model_dump_json().encode(), JSON_HEADERS
 
         return answer
@@ -46,10 +46,10 @@ def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
     # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: it is not read. As a
     # Triton that serves what its configuration pins: loading changes what clients get only where the model was not
     # there at all. Moving `production` is /v1/admin's, with a way back.
-    def repository(command: str, kind: type[Load | Unload]) -> Answer:
+    def repository(kind: type[Load | Unload]) -> Answer:
         async def answer(call: Call) -> tuple[bytes, Headers]:
             check_media_type(call.headers, JSON, BINARY, optional=True)
-            await carry_out(call, command, kind())
+            await carry_out(call, kind())
             return b"{}", JSON_HEADERS
 
         return answer
@@ -62,6 +62,6 @@ def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
             Route(POST, f"{admin}/{{name}}/{command}", Access.admin, kind.summary, commanded(command))
             for command, kind in COMMANDS.items()
         ),
-        Route(POST, f"{model}/load", Access.admin, load, repository("load", Load)),
-        Route(POST, f"{model}/unload", Access.admin, unload, repository("unload", Unload)),
+        Route(POST, f"{model}/load", Access.admin, load, repository(Load)),
+        Route(POST, f"{model}/unload", Access.admin, unload, repository(Unload)),
     ]

@@ -1,57 +1,61 @@
 """Objects below one URI: s3:// (Amazon's, and every storage of that protocol), and http(s)://, which is only read.
 
-botocore finds credentials, region and endpoint as Amazon's own tools do, and signs a URL for each call; the calls
-themselves are `storage_http.py`'s, so that a storage which sends too much or too slowly is refused.
+botocore finds credentials, region and endpoint as Amazon's own tools do, and signs a URL for each call. The calls are
+our own and bounded, so that a storage which sends too much or too slowly is refused; redirects are not followed.
 """
 
 from __future__ import annotations
 
+import functools
 import io
+import os
 import re
+import ssl
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
-from urllib.parse import quote, unquote, urlsplit
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+from urllib.parse import quote, urlsplit
+
+import httpcore
 
 from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
-from rlservo.export.contract.extras import install, needs_extra
-
-if TYPE_CHECKING:
-    from rlservo.serve_app.repository.storage_http import Reply
+from rlservo.export.contract.extras import install
+from rlservo.serve_app.repository.storage import TIMEOUT_S, place_of
+from rlservo.serve_app.wire.bounded_http import FAILURES, MOST_HELD, DeadlineBackend, connection_pool
 
 PAGE = 2 << 20  # [bytes] of a list: 1,000 names of at most 1,024 bytes
 MOST_PAGES = 100
+SLOWEST = 256 << 10  # [bytes/s] of a body, after the time-out
+REFUSAL = 4096  # [bytes] of a refusal's body, for the error message
 RETRY_AFTER_S = 0.2
-_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.:-]+://")  # two letters and more: C:// would be a drive
 _SECRETS = re.compile(r"[A-Za-z0-9+/=_.~%-]{32,}|\b(AKIA|ASIA)[A-Z0-9]+")  # which a storage may repeat
 _CONDITIONS = {"IfNoneMatch": "If-None-Match", "IfMatch": "If-Match"}
 
 
-def is_uri(place: str | Path) -> bool:
-    """Return whether a place is named by a protocol."""
-    return isinstance(place, str) and _SCHEME.match(place) is not None
+class _TooLongError(Exception):
+    """The reply has more bytes than it may."""
 
 
-def place_of(place: str | Path) -> str:
-    """Return an absolute folder (or `file://`) or a URI that holds no secret. Raises UsageError."""
-    if not is_uri(place):
-        return str(Path(place).expanduser().absolute())
-    parts = urlsplit(str(place).rstrip("/"))
-    if parts.scheme == "file" and parts.netloc in ("", "localhost"):
-        return unquote(parts.path) or "/"
-    if parts.scheme not in ("s3", "http", "https") or not parts.hostname or "@" in parts.netloc or parts.query:
-        shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
-        raise UsageError(
-            f"{shown}: expected s3://bucket/policies, https://host/policies or file:///policies; a password or query "
-            "may be a secret, and credentials come from the environment"
-        )
-    return parts.geturl()
+@dataclass(frozen=True)
+class Reply:
+    """Answer of a storage; the body of a success is elsewhere."""
+
+    status: int
+    headers: Mapping[str, str]
+    refusal: str = ""  # the beginning of its body
+
+    @property
+    def reason(self) -> str:
+        """What the storage says of its refusal, without secrets."""
+        parts = re.findall(r"<(?:Code|Message)>([^<]+)</", self.refusal)
+        return _hidden(": ".join(parts[:2])) or f"status {self.status}"
 
 
 class ObjectStorage:
     """Objects below one URI."""
 
-    def __init__(self, uri: str, *, timeout_s: float = 15.0) -> None:
+    def __init__(self, uri: str, *, timeout_s: float = TIMEOUT_S / 2) -> None:
         """Nothing is asked yet. Each call may take `timeout_s`, with a large object longer. Raises UsageError."""
         self.uri = place_of(uri)
         self.timeout_s = timeout_s
@@ -124,35 +128,68 @@ class ObjectStorage:
         most: int = 0,
     ) -> Reply:
         """Send a request, and once more if the connection breaks or the storage is busy."""
-        with needs_extra("remote", "httpcore"):
-            from rlservo.serve_app.repository.storage_http import TooLongReplyError, request
-        place, timeout_s = f"{self.uri}/{name}", self.timeout_s
-        headers = {header: given[key] for key, header in _CONDITIONS.items() if key in given}
-        reason = ""
+        place, into, reason = f"{self.uri}/{name}", into or io.BytesIO(), ""
+        headers: dict[bytes | str, bytes | str] = {_CONDITIONS[key]: given[key] for key in given if key in _CONDITIONS}
         for _ in range(2):
-            verb, url = self._signed(method, name, given)
-            into = into or io.BytesIO()
+            url = self._signed(method, name, given)
             into.seek(0)
             into.truncate()
             try:
-                reply = request(verb, url, headers, body, into=into, most=most, timeout_s=timeout_s)
-            except TooLongReplyError:
+                reply = self._exchange(url, headers, body if method == "put_object" else None, into, most)
+            except _TooLongError:
                 kind = UnavailableError if method == "list_objects_v2" else BundleError
                 raise kind(f"{place}: the storage sends more than the {most:,} bytes that it may") from None
-            except TimeoutError:
-                raise UnavailableError(f"{place} gave no answer within {timeout_s:.0f} s, or too slow a one") from None
-            except ConnectionError as error:
-                reason = _hidden(str(error))
+            except httpcore.TimeoutException:
+                raise UnavailableError(
+                    f"{place} gave no answer within {self.timeout_s:.0f} s, or too slow a one"
+                ) from None
+            except FAILURES as error:
+                length = into.tell()
+                reason = f"the connection broke after {length:,} bytes" if length else _hidden(first_line(error))
             else:
                 if reply.status < 429:
                     return reply
-                reason = _said(reply)
+                reason = reply.reason
             time.sleep(RETRY_AFTER_S)
         raise UnavailableError(f"{place} cannot be reached or read: {reason}")
 
-    def _signed(self, method: str, name: str, given: dict[str, str]) -> tuple[str, str]:
+    def _exchange(
+        self, url: str, headers: dict[bytes | str, bytes | str], body: bytes | None, into: BinaryIO, most: int
+    ) -> Reply:
+        """Put a body or get one; write that of a success, never unpacked, into `into`.
+
+        Raises _TooLongError beyond `most` bytes, and httpcore's errors: TimeoutException when connecting takes longer
+        than the time-out, or the rest longer than that plus the time that the received bytes take at `SLOWEST`.
+        """
+        backend = DeadlineBackend()
+        backend.deadline = deadline = time.monotonic() + self.timeout_s + len(body or b"") / SLOWEST
+        content = None
+        if body is not None:
+            headers = {"Content-Length": str(len(body)), **headers}
+            content = (body[start : start + MOST_HELD] for start in range(0, len(body), MOST_HELD))
+        waits = {"timeout": dict.fromkeys(("connect", "read", "write"), self.timeout_s)}
+        method, length, refusal = "GET" if body is None else "PUT", 0, b""
+        with (
+            connection_pool(url, backend, lambda: _trusted(os.environ.get("AWS_CA_BUNDLE") or None)) as pool,
+            pool.stream(method, url, headers=headers, content=content, extensions=waits) as reply,
+        ):
+            found = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in reply.headers}
+            for block in reply.iter_stream():
+                length += len(block)
+                backend.deadline = deadline + length / SLOWEST
+                if 200 <= reply.status < 300:
+                    if length > most:
+                        raise _TooLongError
+                    into.write(block)
+                else:
+                    refusal += block[:REFUSAL]
+                    if length >= REFUSAL:
+                        break
+            return Reply(reply.status, found, refusal.decode(errors="replace"))
+
+    def _signed(self, method: str, name: str, given: dict[str, str]) -> str:
         if self.is_read_only:
-            return "GET", f"{self.uri}/{quote(name)}"
+            return f"{self.uri}/{quote(name)}"
         key = {} if "Prefix" in given else {"Key": f"{self._prefix}/{name}".lstrip("/")}
         try:
             if self._client is None:
@@ -160,30 +197,28 @@ class ObjectStorage:
                 from botocore.session import get_session
 
                 self._client = get_session().create_client("s3", config=Config(signature_version="s3v4"))
-            url = self._client.generate_presigned_url(method, Params={"Bucket": self._bucket, **key, **given})
+            params = {"Bucket": self._bucket, **key, **given}
+            return str(self._client.generate_presigned_url(method, Params=params))
         except ImportError:
             raise UsageError(f"{self.uri} cannot be opened here: {install('remote')}") from None
         except Exception as error:  # botocore has a class for each thing that credentials may lack
             raise UnavailableError(f"{self.uri} cannot be signed for: {_hidden(first_line(error))}") from None
-        return "PUT" if method == "put_object" else "GET", url
 
     def _succeeded(self, reply: Reply, name: str) -> Reply:
         if 200 <= reply.status < 300:
             return reply
-        said = f"cannot be reached or read: {_said(reply)}"
+        said = f"cannot be reached or read: {reply.reason}"
         if reply.status in (401, 403):
-            said = f"is refused with the credentials of this process's environment ({_said(reply)})"
+            said = f"is refused with the credentials of this process's environment ({reply.reason})"
         elif reply.status < 400:
             place = reply.headers.get("x-amz-bucket-region") or reply.headers.get("location", "").partition("?")[0]
             said = f"is redirected to {_hidden(place)}, which is not followed"
         raise UnavailableError(f"{self.uri}/{name} {said}")
 
 
-def _said(reply: Reply) -> str:
-    """Return what a storage says of its refusal, without secrets."""
-    text = reply.refusal.decode(errors="replace")
-    parts = [found[1] for tag in ("Code", "Message") if (found := re.search(f"<{tag}>([^<]+)</{tag}>", text))]
-    return _hidden(": ".join(parts)) or f"status {reply.status}"
+@functools.cache
+def _trusted(certificates: str | None) -> ssl.SSLContext:
+    return ssl.create_default_context(cafile=certificates)
 
 
 def _hidden(text: str) -> str:

@@ -1,8 +1,8 @@
-"""Publication of a bundle as a version that never changes: its files, and at last its line in the index.
+"""Publication of a bundle as a version that never changes: its files, and last its line in the index.
 
-SHA256SUMS is written first and claims the version's number: of two publishers with different bundles one is refused
+SHA256SUMS is written first and claims the version's number: of two publishers with different bundles, one is refused
 before it has written anything else. Objects are only created, never overwritten, and read back; the index is replaced
-only if no other writer has replaced it. So a version that can be seen is whole.
+only if no other writer has replaced it. So a version that is listed is complete.
 """
 
 from __future__ import annotations
@@ -15,17 +15,28 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rlservo.export.contract.bundle import SUMS_FILE, Bundle, digest_of
 from rlservo.export.contract.contract import VERSION_PATTERN, version_key
 from rlservo.export.contract.errors import BundleError, ConflictError, UnavailableError, UsageError
-from rlservo.serve_app.repository.object_storage import ObjectStorage, is_uri, place_of
-from rlservo.serve_app.repository.remote_repository import INDEX, MAX_INDEX_BYTES, Index, check_file_type
+from rlservo.serve_app.repository.remote_repository import INDEX, Index, check_file_type
+from rlservo.serve_app.repository.storage import (
+    MAX_DOCUMENT_BYTES,
+    TIMEOUT_S,
+    FolderStorage,
+    is_uri,
+    object_storage,
+    place_of,
+)
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.repository.object_storage import ObjectStorage
 
 ATTEMPTS = 20  # at the index, each after others have published
 
 
-def publish(bundle: Bundle, place: str, *, timeout_s: float = 15.0, progress: Callable[[str], object] = str) -> str:
+def publish(bundle: Bundle, place: str, *, progress: Callable[[str], object] = str) -> str:
     """Publish a bundle to a folder or URI under its own name and version; return where it is.
 
     `progress` gets a line per file. Raises ConflictError if that version is there, or is being published,
@@ -37,23 +48,20 @@ def publish(bundle: Bundle, place: str, *, timeout_s: float = 15.0, progress: Ca
     if bundle.contract.name == INDEX:
         raise BundleError(f"a policy named {INDEX} cannot be published: the index of versions has that name")
     if is_uri(root):
-        _publish_to_storage(bundle, ObjectStorage(root, timeout_s=timeout_s), progress)
+        _publish_to_storage(bundle, object_storage(root, TIMEOUT_S), progress)
     else:
         _publish_to_folder(bundle, Path(root))
     return f"{root}/{_name_of(bundle)}"
 
 
-def next_version(place: str, name: str, *, timeout_s: float = 15.0) -> str:
+def next_version(place: str, name: str) -> str:
     """Return the integer after the newest version at a folder or URI; one that was begun is not free.
 
     Raises UsageError and UnavailableError.
     """
     root = place_of(place)
-    if is_uri(root):
-        entries = [each.partition("/")[0] for each in ObjectStorage(root, timeout_s=timeout_s).names(name)]
-    else:
-        folder = Path(root) / name
-        entries = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+    storage = object_storage(root, TIMEOUT_S) if is_uri(root) else FolderStorage(Path(root))
+    entries = {each.partition("/")[0] for each in storage.names(name)}
     versions = [version_key(text)[0] for text in entries if re.fullmatch(VERSION_PATTERN, text)]
     return str(max(versions, default=0) + 1)
 
@@ -77,7 +85,7 @@ def _publish_to_storage(bundle: Bundle, storage: ObjectStorage, progress: Callab
 
     def read_index() -> tuple[Index, str]:
         try:
-            content, tag = storage.read(INDEX, MAX_INDEX_BYTES)
+            content, tag = storage.read(INDEX, MAX_DOCUMENT_BYTES)
         except FileNotFoundError:
             return Index(), ""
         return Index.parse(content, f"{storage.uri}/{INDEX}"), tag

@@ -3,8 +3,8 @@
     <uri>/index.json             the hash of every version: without its line there is no such version
     <uri>/<name>/<version>/...   the bundle's files, which never change
 
-Whoever may write there wrote them: names, sizes and numbers are checked before anything is made of them. What is in
-the cache needs no storage, so what runs continues, and starts again, while the storage is unreachable.
+Anyone with write access there may have written them: names, sizes and numbers are checked before they are used. What is
+in the cache needs no storage: servers continue, and start again, while the storage is unreachable.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ from rlservo.export.contract.bundle import DEFAULT_LIMITS, MAX_FILES, MAX_SUMS_B
 from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault
 from rlservo.export.contract.errors import BundleError, BundleTamperedError
 from rlservo.serve_app.repository.bundle_cache import BundleCache
-from rlservo.serve_app.repository.object_storage import ObjectStorage
+from rlservo.serve_app.repository.storage import MAX_DOCUMENT_BYTES, object_storage
 
 Key = tuple[str, str]  # (name, version)
 INDEX = "index.json"
-MAX_INDEX_BYTES = 16 << 20
 MAX_FILE_BYTES = 4 << 30  # where no limit is set
 DATA_SUFFIXES = (".onnx", ".ts", ".json", ".npz", ".md", ".txt", ".csv", ".yaml", ".png")
 """Of files that a user has added to a bundle: nothing that something might run or unpickle."""
@@ -55,16 +54,19 @@ class Index(BaseModel):
 class RemoteRepository:
     """Published versions below one URI."""
 
-    def __init__(self, storage: ObjectStorage, cache: BundleCache, limits: BundleLimits = DEFAULT_LIMITS) -> None:
-        self.uri = storage.uri
+    def __init__(
+        self, uri: str, cache: BundleCache, limits: BundleLimits = DEFAULT_LIMITS, *, timeout_s: float
+    ) -> None:
+        """Take the time-out of a look or a fetch. Raises UsageError."""
+        self.uri = uri
         self.cache = cache
-        self._storage = storage
+        self._storage = object_storage(uri, timeout_s)
         self._limits = limits
 
     def versions(self) -> dict[Key, str]:
         """Return the hash of every published version. Raises UnavailableError, and BundleError if there is none."""
         try:
-            index = Index.parse(self._storage.read(INDEX, MAX_INDEX_BYTES)[0], f"{self.uri}/{INDEX}")
+            index = Index.parse(self._storage.read(INDEX, MAX_DOCUMENT_BYTES)[0], f"{self.uri}/{INDEX}")
         except FileNotFoundError:
             raise BundleError(f"{self.uri} has no {INDEX}: nothing was published there (`rlservo publish`)") from None
         return {(name, version): digest for name, each in index.policies.items() for version, digest in each.items()}
@@ -82,8 +84,8 @@ class RemoteRepository:
             found, sums = read_sums(entry)
             if found != digest:
                 raise BundleTamperedError(
-                    f"{place} is not the bundle that was accepted as version {version} of '{name}' (its hashes are "
-                    "others): published versions do not change; publish changes as a new version"
+                    f"{place} is not the bundle that was accepted as version {version} of '{name}' (its hashes "
+                    "differ): published versions do not change; publish changes as a new version"
                 )
             if len(sums) > MAX_FILES:
                 raise BundleError(f"{place} lists {len(sums)} files: at most {MAX_FILES}")

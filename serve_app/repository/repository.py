@@ -1,8 +1,7 @@
 """Bundles by name and version, in folders and behind URIs; distinguished by their hashes.
 
-A name or version that a request brings is only ever compared with what the places hold; no path is made of it.
-Everything here blocks (hashing, onnxruntime, golden vectors, networks), and may do so indefinitely where a file system
-hangs: `versions/version_loader.py` calls it through `BlockingCalls`.
+A name or version in a request is only compared with those of the bundles; no path is made of it. Everything here
+blocks, indefinitely if a file system hangs: `versions/version_loader.py` calls it through `BlockingCalls`.
 """
 
 from __future__ import annotations
@@ -24,23 +23,22 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.serve_app.repository.bundle_cache import BundleCache, default_folder
-from rlservo.serve_app.repository.object_storage import ObjectStorage, is_uri, place_of
 from rlservo.serve_app.repository.remote_repository import Key, RemoteRepository
+from rlservo.serve_app.repository.storage import TIMEOUT_S, is_uri, place_of
 
 CACHE_BYTES = 10 << 30
-TIMEOUT_S = 30.0
 
 
 @dataclass
 class Listing:
-    """Result of one look through all places."""
+    """Bundles and faults found by one look through all places."""
 
     found: dict[Key, tuple[str, str]] = field(default_factory=dict)  # (hash, where it is)
     errors: dict[Key, RlservoError] = field(default_factory=dict)  # of what cannot be served
     unread: list[UnavailableError] = field(default_factory=list)  # of storages that do not answer
 
     def add(self, key: Key, digest: str, place: str) -> None:
-        """Add a bundle. A copy of one that is there is the same; another one makes neither of them usable."""
+        """Add a bundle. A copy of one counts once; two different ones of the same version make neither usable."""
         there, where = self.found.setdefault(key, (digest, place))
         if there != digest:
             self.errors[key] = UsageError(
@@ -61,8 +59,8 @@ class Listing:
     def available(self, *, needs_all: bool) -> dict[str, dict[str, str]]:
         """Return every bundle's hash by name and version, for a first plan.
 
-        With `needs_all` all that is there has to be good: raises BundleError or UsageError, and UnavailableError where
-        a storage does not answer.
+        With `needs_all` no bundle may be broken. Raises BundleError or UsageError, and UnavailableError if a storage
+        does not answer.
         """
         if self.unread:
             raise self.unread[0]
@@ -76,7 +74,7 @@ class Listing:
     def find(self, name: str, version: str | None) -> tuple[str, str]:
         """Return (version, hash) of a bundle; None is the newest one.
 
-        Raises UnknownPolicyError or UnknownVersionError, what is wrong with the bundle of that name and version, and
+        Raises UnknownPolicyError or UnknownVersionError, the bundle's own error if it cannot be served, and
         UnavailableError if a storage that does not answer may have it.
         """
         digests = {v: digest for (n, v), digest in self.digests.items() if n == name}
@@ -86,7 +84,7 @@ class Listing:
         wanted = version if version is not None else (versions[-1] if versions else None)
         if wanted is not None and wanted in digests:
             return wanted, digests[wanted]
-        # A bundle of that name and version that cannot be served says more than that there is none.
+        # The error of a broken bundle helps more than the statement that there is none.
         for key, error in self.errors.items():
             if key[0] == name and version in (key[1], None):
                 raise error
@@ -112,10 +110,7 @@ class Repository:
         cache_bytes: int = CACHE_BYTES,
         timeout_s: float = TIMEOUT_S,
     ) -> None:
-        """`cache` is the folder that bundles behind URIs are fetched into. Raises UsageError.
-
-        Each call to a storage may take half of `timeout_s`, so that one that hangs is named before a look is given up.
-        """
+        """Bundles behind URIs are fetched into the folder `cache`. Raises UsageError."""
         given = [place_of(place) for place in places]
         if not given:
             raise UsageError("no policy to serve: give at least one bundle folder")
@@ -123,11 +118,10 @@ class Repository:
         self._limits = limits
         self._seen: dict[tuple[str, str, str], Path] = {}
         """The folders of the last look, by name, version and hash."""
-        storages = [ObjectStorage(place, timeout_s=timeout_s / 2) for place in given if is_uri(place)]
         self._remote: list[RemoteRepository] = []
-        if storages:
+        if uris := [place for place in given if is_uri(place)]:
             bundles = BundleCache(Path(cache) if cache is not None else default_folder() / "bundles", cache_bytes)
-            self._remote = [RemoteRepository(storage, bundles, limits) for storage in storages]
+            self._remote = [RemoteRepository(uri, bundles, limits, timeout_s=timeout_s) for uri in uris]
 
     def look(self) -> Listing:
         """Look through all places."""
@@ -147,14 +141,24 @@ class Repository:
     def fetch(self, name: str, version: str, digest: str) -> Iterator[Path]:
         """Give the folder of an accepted bundle, which stays until the block ends.
 
-        Raises BundleTamperedError if the bundle of that name and version has another hash by now, and what is wrong
-        with it if it cannot be served.
+        Its files may have changed since: the loader compares every hash. Raises BundleTamperedError if the bundle of
+        that name and version has another hash by now, and what is wrong with it if it cannot be served.
         """
         errors: list[RlservoError] = []
-        folder = self._seen.get((name, version, digest))
-        if folder is None or not self._holds(folder, name, version, digest):
-            # Otherwise without a look at all others, which for a thousand of them would be a million.
-            folder = self._find_in_folders(name, version, digest, errors) if self._paths else None
+        key = (name, version)
+        folder = self._seen.get((*key, digest))
+        if self._paths and (folder is None or not _holds(folder, digest)):  # a look at all others takes longer
+            listing = Listing()
+            self._look_in_folders(listing)
+            folder = self._seen.get((*key, digest))
+            if folder is None and key in listing.found:
+                errors.append(
+                    BundleTamperedError(
+                        f"{listing.found[key][1]} is not the bundle that was accepted as version {version} of "
+                        f"'{name}' (its hashes differ): export changes under a new version, or load this one again"
+                    )
+                )
+            errors += [error for each, error in listing.errors.items() if each == key]
         if folder is not None:
             yield folder
             return
@@ -172,32 +176,12 @@ class Repository:
         raise next((error for error in errors if isinstance(error, UnavailableError)), errors[0])
 
     def touch(self, digests: Collection[str]) -> None:
-        """Keep what is served in the cache."""
+        """Mark bundles as used in the cache: they are served."""
         for remote in self._remote[:1]:  # they share it
             remote.cache.touch(digests)
 
-    def _find_in_folders(self, name: str, version: str, digest: str, errors: list[RlservoError]) -> Path | None:
-        listing = Listing()
-        self._look_in_folders(listing)
-        if (name, version) in listing.found and (name, version, digest) not in self._seen:
-            errors.append(
-                BundleTamperedError(
-                    f"{listing.found[name, version][1]} is not the bundle that was accepted as version {version} of "
-                    f"'{name}' (its hashes are others): export changes under a new version, or load this one again"
-                )
-            )
-        errors += [error for key, error in listing.errors.items() if key == (name, version)]
-        return self._seen.get((name, version, digest))
-
-    def _holds(self, folder: Path, name: str, version: str, digest: str) -> bool:
-        try:
-            contract = read_contract(folder, self._limits)
-            return (contract.name, contract.version, digest_of(folder)) == (name, version, digest)
-        except BundleError:
-            return False
-
     def _look_in_folders(self, listing: Listing) -> None:
-        """Add what the folders hold."""
+        """Add the bundles of the folders."""
         seen: dict[tuple[str, str, str], Path] = {}
         folders: dict[Path, Path] = {}  # resolved -> as given: the same folder given twice counts once
         for path in self._paths:
@@ -215,6 +199,13 @@ class Repository:
             seen.setdefault((*key, digest), folder)
             listing.add(key, digest, str(folder))
         self._seen = seen
+
+
+def _holds(folder: Path, digest: str) -> bool:
+    try:
+        return digest_of(folder) == digest
+    except BundleError:
+        return False
 
 
 def raise_all(errors: Sequence[RlservoError]) -> None:

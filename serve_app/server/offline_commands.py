@@ -31,8 +31,7 @@ class OfflineCommands:
             given = parse(command, document)
         except RequestError as error:
             raise UsageError(error.message) from None
-        what = f"{command} {name} {given.words()}".strip()
-        plan = asyncio.run(given.give(PlanWriter(self._loader, self._files), name, what))
+        plan = asyncio.run(PlanWriter(self._loader, self._files).give(given, name))
         return {**Changed.of(plan, name).model_dump(), "place": self._files.place}
 
     def listing(self) -> dict[str, Any]:

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.repository.repository import Repository
+from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.policy_store import PolicyStore, load_policy
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
@@ -35,7 +36,7 @@ def load_served(
 def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> VersionLoader:
     """Return what loads the versions of these folders and URIs as the settings say. Raises UsageError."""
     limits = settings.bundle_limits
-    load = partial(load_policy, threads=settings.threads, options=settings.policy_options, limits=limits)
+    load = partial(Policy.load, threads=settings.threads, limits=limits)
     repository = Repository(
         places,
         limits,
@@ -43,7 +44,7 @@ def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> Ve
         cache_bytes=settings.cache_bytes,
         timeout_s=settings.load_timeout_s,
     )
-    return VersionLoader(repository, load, timeout_s=settings.load_timeout_s)
+    return VersionLoader(repository, load, options=settings.policy_options, timeout_s=settings.load_timeout_s)
 
 
 def plan_files(places: Sequence[str | Path], settings: ServerSettings) -> PlanFiles:

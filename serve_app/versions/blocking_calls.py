@@ -1,8 +1,8 @@
 """Calls into a file system that may never return, in threads that can be given up.
 
 A network file system that is gone blocks every caller that opens, reads or even looks at a file, and nothing can
-interrupt that. So such a call runs in a thread of its own, which is waited for no longer than a time-out; a
-thread that was given up ends when the file system comes back, or with the process. There are only a few of them.
+interrupt that. So each such call runs in a thread of its own, with a time-out. A thread that was given up ends when the
+file system returns, or with the process. Their number is limited.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future
+from functools import partial
 from typing import Any, TypeVar
 
 from rlservo.export.contract.errors import UnavailableError
 
 logger = logging.getLogger(__name__)
 
-SILENCE_S = 10.0  # [s] after which it is said what is waited for
-LIMIT = 4  # threads at once, those that were given up included
+SILENCE_S = 10.0  # [s] after which a waiting call is logged
+LIMIT = 4  # threads at once, including those that were given up
 
 Result = TypeVar("Result")
 
@@ -36,7 +36,7 @@ class BlockingCalls:
     async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None, what: str) -> Result:
         """Return what the function returns; raise what it raises, and UnavailableError when it takes too long.
 
-        `what` says in the error what was being done. None waits for as long as it takes.
+        `what` names the activity in the error. A `timeout_s` of None waits for as long as it takes.
         """
         began = time.monotonic()
         try:
@@ -46,7 +46,7 @@ class BlockingCalls:
                 f"{what} could not start within {timeout_s:g} s: {self._limit} earlier calls have not come back "
                 "from the file system"
             ) from None
-        returned = asyncio.wrap_future(self._start(function, arguments))
+        returned = self._start(function, arguments)
         try:
             done: set[asyncio.Future[Result]] = set()
             while not done and (timeout_s is None or time.monotonic() - began < timeout_s):
@@ -55,37 +55,34 @@ class BlockingCalls:
                 if not done and left_s >= SILENCE_S:
                     logger.warning("waiting for %s (%.0f s)", what, time.monotonic() - began)
         finally:
-            returned.cancel()  # if it has not returned: it is no longer waited for
+            returned.cancel()  # if it has not returned, its result is no longer wanted
         if not done:
             raise UnavailableError(
                 f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?"
             )
         return returned.result()
 
-    def _start(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> Future[Result]:
-        future: Future[Result] = Future()
-        future.set_running_or_notify_cancel()  # from now on it cannot be cancelled, only left alone
+    def _start(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> asyncio.Future[Result]:
         loop = asyncio.get_running_loop()
+        returned: asyncio.Future[Result] = loop.create_future()
 
         def call() -> None:
-            result: Any = None
-            error: BaseException | None = None
+            settle: Callable[[], None]
             try:
-                result = function(*arguments)
-            except BaseException as raised:
-                error = raised
+                settle = partial(returned.set_result, function(*arguments))
+            except BaseException as error:
+                settle = partial(returned.set_exception, error)
             with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(self._free.release)  # before the result, with which the loop may end
-            if error is None:
-                future.set_result(result)
-            else:
-                future.set_exception(error)
+                loop.call_soon_threadsafe(finish, settle)
 
-        # A daemon: the process can end while the thread is stuck.
-        thread = threading.Thread(target=call, name="policies", daemon=True)
-        try:
-            thread.start()
+        def finish(settle: Callable[[], None]) -> None:
+            self._free.release()
+            if not returned.cancelled():
+                settle()
+
+        try:  # a daemon thread, so that the process can end while it is stuck
+            threading.Thread(target=call, name="policies", daemon=True).start()
         except RuntimeError:  # there are too many in this process
             self._free.release()
             raise
-        return future
+        return returned

@@ -1,118 +1,210 @@
-"""Commands of an operator: load, unload, alias, rollback, canary, shadow; by a server or on a repository itself."""
+"""Commands that change a plan: load, unload, alias, rollback, canary, shadow; by a server or on a repository itself.
+
+A command returns the policies after it, and leaves the plan as it is. No command touches a file.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, ClassVar, Protocol
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+from typing_extensions import Self
 
-from rlservo.export.contract.contract import first_fault
-from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.versions import plan_changes
-from rlservo.serve_app.versions.plan_writer import Change
-from rlservo.serve_app.versions.serving_plan import PRODUCTION, Alias, Canary, Plan, PolicyPlan, Reference, Version
+from rlservo.export.contract.contract import first_fault, version_key
+from rlservo.export.contract.errors import (
+    ConflictError,
+    RequestError,
+    RlservoError,
+    UnknownPolicyError,
+    UnknownVersionError,
+)
+from rlservo.serve_app.versions.serving_plan import (
+    PRODUCTION,
+    Alias,
+    Canary,
+    Plan,
+    PolicyConfig,
+    PolicyPlan,
+    Reference,
+    ServedConfig,
+    Version,
+)
 
+LONGEST_HISTORY = 16  # earlier versions of an alias that a rollback can go back through
 
-class Control(Protocol):
-    """Writer of a plan: a process that serves it, or a writer alone."""
-
-    async def load(self, name: str, version: str | None, *, what: str) -> Plan:
-        """Find a version in the repository (None: the newest), and add it."""
-        ...
-
-    async def change(self, change: Change, *, what: str) -> Plan:
-        """Make a change; `what` is kept as who did what."""
-        ...
+Policies = dict[str, PolicyPlan]
 
 
 class Command(BaseModel):
     """One command on one policy."""
 
     model_config = ConfigDict(extra="forbid")
+    verb: ClassVar[str]
     summary: ClassVar[str]
-    apply: ClassVar[Callable[..., dict[str, PolicyPlan]]]
-    """What it does to a plan, given the policy's name and the fields."""
 
-    version: Any = Field(None, exclude=True)  # of a command that takes none
-
+    @property
     def words(self) -> str:
-        """Return what follows the command and the policy's name."""
-        return str(self.version or "")
+        """What follows the command and the policy's name on the command line."""
+        return ""
 
-    async def give(self, control: Control, name: str, what: str) -> Plan:
-        """Carry it out; return the plan with it. Raises what the control raises."""
-        return await control.change(partial(type(self).apply, name=name, **self.model_dump()), what=what)
+    def line(self, name: str) -> str:
+        """Return the command in a line, for the plan and the logs."""
+        return f"{self.verb} {name} {self.words}".strip()
+
+    def change(self, plan: Plan, name: str) -> Policies:
+        """Return the policies after it. Raises UnknownPolicyError, UnknownVersionError, ConflictError, RequestError."""
+        raise NotImplementedError
 
 
 class Load(Command):
+    """Add a version, or take its bundle as it is now; what clients get stays as it is.
+
+    The first version of a policy that is not served becomes its `production`: it changes no reply but a 404.
+    """
+
+    verb = "load"
     summary = "Load a version, prove it, and keep it ready: not in use until an alias leads to it"
     version: Version | None = Field(default=None, description="The repository's newest when left out.")
+    _digest: str = PrivateAttr("")
 
+    @property
     def words(self) -> str:
         return self.version or "newest"
 
-    async def give(self, control: Control, name: str, what: str) -> Plan:
-        return await control.load(name, self.version, what=what)
+    @classmethod
+    def of(cls, version: str, digest: str) -> Self:
+        """Return the command for a bundle that the repository holds; without one it cannot change a plan."""
+        command = cls(version=version)
+        command._digest = digest
+        return command
+
+    def change(self, plan: Plan, name: str) -> Policies:
+        policy, version = plan.policies.get(name) or PolicyPlan(versions={}), str(self.version)
+        uses = _uses(policy, version)
+        if uses and policy.versions[version] != self._digest:
+            raise ConflictError(
+                f"policy '{name}' version {version} is in use by {uses}, and its folder holds another bundle by now: "
+                "export changes under a new version, or point that elsewhere first"
+            )
+        return _with(plan, name, policy, versions={**policy.versions, version: self._digest})
 
 
 class Unload(Command):
+    verb = "unload"
     summary = "Drop a version, or the policy"
-    apply = plan_changes.unload
     version: Version | None = Field(default=None, description="The whole policy when left out.")
+
+    @property
+    def words(self) -> str:
+        return self.version or ""
+
+    def change(self, plan: Plan, name: str) -> Policies:
+        policy, version = plan.policy(name), self.version
+        if version is None:  # its history stays: a rollback after it is loaded again still knows what was in use
+            return _with(plan, name, policy, versions={}, aliases={}, canary=None, shadow=None)
+        _require(name, policy, version)
+        if len(policy.versions) == 1:
+            raise ConflictError(f"version {version} is the last of policy '{name}': unload the policy itself")
+        if uses := _uses(policy, version):
+            raise ConflictError(f"policy '{name}' version {version} is in use by {uses}: point that elsewhere first")
+        return _with(plan, name, policy, versions={v: each for v, each in policy.versions.items() if v != version})
 
 
 class SetAlias(Command):
+    """Let an alias lead to a loaded version, or remove it; `production` can only be moved.
+
+    `expected` protects another operator's move from being undone unseen. The same command twice is no contradiction.
+    """
+
+    verb = "alias"
     summary = "Let an alias lead to a loaded version"
-    apply = plan_changes.set_alias
     alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
     version: Version | None = Field(description="A loaded version; null removes the alias.")
     expected: Version | None = Field(None, description="Where the alias leads now; when it does not, nothing changes.")
 
+    @property
     def words(self) -> str:
         return f"{self.alias}={self.version or ''}"
 
+    def change(self, plan: Plan, name: str) -> Policies:
+        policy, alias = plan.policy(name), self.alias
+        if policy.aliases.get(alias) != self.version:
+            _expect(policy, name, alias, self.expected)
+        if self.version is not None:
+            _require(name, policy, self.version)
+            return _with(plan, name, policy, aliases={**policy.aliases, alias: self.version})
+        if alias not in policy.aliases:
+            raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(policy.aliases)}")
+        if alias == PRODUCTION:
+            raise ConflictError(
+                f"the alias '{PRODUCTION}' of policy '{name}' says what clients get that ask for no version: point it "
+                "elsewhere, or unload the policy"
+            )
+        for use, reference in policy.uses.items():
+            if reference == alias:
+                raise ConflictError(f"the alias '{alias}' of policy '{name}' is in use by {use}: end that first")
+        return _with(plan, name, policy, aliases={a: v for a, v in policy.aliases.items() if a != alias})
+
 
 class Rollback(Command):
+    """Let an alias lead where it led before, to the same bundle, which is loaded again if need be."""
+
+    verb = "rollback"
     summary = "Let an alias lead where it led before"
-    apply = plan_changes.roll_back
     alias: Alias = Field(PRODUCTION, description="The alias; `production` when left out.")
     expected: Version | None = Field(
         None, description="Where the alias leads now; when it does not, nothing changes. Makes a repeated command safe."
     )
 
+    @property
     def words(self) -> str:
         return self.alias
 
+    def change(self, plan: Plan, name: str) -> Policies:
+        policy, alias = plan.policy(name), self.alias
+        _expect(policy, name, alias, self.expected)
+        *earlier, version = policy.history.get(alias, ()) or ("",)
+        if not version:
+            raise ConflictError(f"the alias '{alias}' of policy '{name}' has no previous version to roll back to")
+        versions = {version: policy.unloaded.get(version, ""), **policy.versions}
+        changed = _with(plan, name, policy, versions=versions, aliases={**policy.aliases, alias: version})
+        history = {**changed[name].history, alias: tuple(earlier)}
+        return {**changed, name: changed[name].model_copy(update={"history": history})}
+
 
 class SetCanary(Command):
+    verb = "canary"
     summary = "Send a share of the sessions to another version"
-    apply = plan_changes.set_canary
     version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
     share: float | None = Field(None, ge=0, le=1, description="Of the sessions; 0 ends the canary.")
 
+    @property
     def words(self) -> str:
         return f"{self.version or 'off'} {self.share or ''}".strip()
 
+    def change(self, plan: Plan, name: str) -> Policies:
+        if self.version is not None and self.share is None:
+            raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
+        canary = Canary(version=self.version, share=self.share) if self.version and self.share else None
+        return _with(plan, name, plan.policy(name), canary=canary)
+
 
 class SetShadow(Command):
+    verb = "shadow"
     summary = "Let another version compute along"
-    apply = plan_changes.set_shadow
     version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
 
+    @property
     def words(self) -> str:
         return self.version or "off"
 
+    def change(self, plan: Plan, name: str) -> Policies:
+        return _with(plan, name, plan.policy(name), shadow=self.version)
 
-COMMANDS: dict[str, type[Command]] = {
-    "load": Load,
-    "unload": Unload,
-    "alias": SetAlias,
-    "rollback": Rollback,
-    "canary": SetCanary,
-    "shadow": SetShadow,
-}
+
+KINDS: tuple[type[Command], ...] = (Load, Unload, SetAlias, Rollback, SetCanary, SetShadow)
+COMMANDS = {kind.verb: kind for kind in KINDS}
 
 
 class Changed(BaseModel):
@@ -128,17 +220,10 @@ class Changed(BaseModel):
 
     @classmethod
     def of(cls, plan: Plan, name: str) -> Changed:
-        """Return what a plan says of a policy."""
+        """Return a policy's state in a plan."""
         policy = plan.policies.get(name) or PolicyPlan(versions={})
-        return cls(
-            generation=plan.generation,
-            policy=name,
-            default=policy.default,
-            versions=list(policy.versions),
-            aliases=policy.aliases,
-            canary=policy.canary,
-            shadow=policy.shadow,
-        )
+        state = {field: getattr(policy, field) for field in ("default", "aliases", "canary", "shadow")}
+        return cls(generation=plan.generation, policy=name, versions=list(policy.versions), **state)
 
 
 def parse(command: str, document: dict[str, Any]) -> Command:
@@ -147,3 +232,120 @@ def parse(command: str, document: dict[str, Any]) -> Command:
         return COMMANDS[command].model_validate(document)
     except ValidationError as error:
         raise RequestError(f"{command}: {first_fault(error, shows_input=True)}") from None
+
+
+def first_policies(config: ServedConfig, available: Mapping[str, Mapping[str, str]]) -> Policies:
+    """Return the policies that a configuration means, given the repository's bundles (name -> version -> hash).
+
+    Raises UnknownPolicyError, UnknownVersionError, ConflictError.
+    """
+    unlisted = available if config.unlisted == "load" else ()
+    policies = {}
+    for name, wanted in sorted(({name: PolicyConfig() for name in unlisted} | config.policies).items()):
+        digests = available.get(name)
+        if digests is None:
+            raise UnknownPolicyError(f"the repository has no policy '{name}': it has {_listed(sorted(available))}")
+        for version in wanted.versions or ():
+            if version not in digests:
+                raise UnknownVersionError(
+                    f"the repository has no version {version} of policy '{name}': it has {_listed(digests)}"
+                )
+        versions = {version: digests[version] for version in (digests if wanted.versions is None else wanted.versions)}
+        policies[name] = _changed(
+            name, PolicyPlan(versions={}), versions=versions,
+            aliases=wanted.aliases, canary=wanted.canary, shadow=wanted.shadow,
+        )  # fmt: skip
+    return policies
+
+
+def agrees(plan: Plan, config: ServedConfig) -> bool:
+    """Return whether a plan serves what a configuration means; one that does not name `production` leaves it open."""
+    known = {name: each.versions for name, each in plan.policies.items() if each.versions}
+    try:
+        differing = differences(plan.policies, first_policies(config, known))
+    except RlservoError:
+        return False
+    return all(
+        (field, key) == ("aliases", PRODUCTION) and PRODUCTION not in config.policies.get(name, PolicyConfig()).aliases
+        for name, field, key in differing
+    )
+
+
+def differences(before: Mapping[str, PolicyPlan], after: Mapping[str, PolicyPlan]) -> dict[tuple[str, str, str], Any]:
+    """Return what is served differently after than before, by policy, field and version or alias."""
+    changed: dict[tuple[str, str, str], Any] = {}
+    for name in before.keys() | after.keys():
+        was, now = (policies.get(name) or PolicyPlan(versions={}) for policies in (before, after))
+        for field, old, new in (("versions", was.versions, now.versions), ("aliases", was.aliases, now.aliases)):
+            changed |= {(name, field, key): new.get(key) for key in old | new if old.get(key) != new.get(key)}
+        for field in ("canary", "shadow"):
+            if getattr(was, field) != getattr(now, field):
+                changed[name, field, ""] = getattr(now, field)
+    return changed
+
+
+def _with(plan: Plan, name: str, policy: PolicyPlan, **changes: Any) -> Policies:
+    return {**plan.policies, name: _changed(name, policy, **changes)}
+
+
+def _changed(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
+    """Return a policy with these changes: versions sorted, everything leads to a loaded one, the way back is kept."""
+    values: dict[str, Any] = {field: getattr(was, field) for field in PolicyPlan.model_fields} | changes
+    versions = _sorted(values["versions"])
+    aliases: dict[str, str] = dict(values["aliases"])
+    if versions and PRODUCTION not in aliases:
+        aliases[PRODUCTION] = list(versions)[-1]
+    unloaded = {v: digest for v, digest in _sorted({**was.unloaded, **was.versions}).items() if v not in versions}
+    values |= {"versions": versions, "aliases": aliases, "history": _moved(was, aliases), "unloaded": unloaded}
+    try:
+        policy = PolicyPlan(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ConflictError(f"policy '{name}': {first['msg'].removeprefix('Value error, ')}") from None
+    for reference in policy.uses.values():
+        _require(name, policy, reference)
+    return policy
+
+
+def _moved(policy: PolicyPlan, aliases: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """Return the history after the aliases have moved."""
+    history = dict(policy.history)
+    for alias, version in policy.aliases.items():
+        if aliases.get(alias) != version:
+            history[alias] = (*history.get(alias, ()), version)[-LONGEST_HISTORY:]
+    for alias, version in aliases.items():  # loaded again as what it was: the way back is further back
+        if history.get(alias, ())[-1:] == (version,):
+            history[alias] = history[alias][:-1]
+    return history
+
+
+def _uses(policy: PolicyPlan, version: str) -> str:
+    """Return everything that leads to a version, in words."""
+    return " and ".join(use for use, reference in policy.uses.items() if policy.version_of(reference) == version)
+
+
+def _expect(policy: PolicyPlan, name: str, alias: str, expected: str | None) -> None:
+    """Raise ConflictError if an alias does not lead where the caller believes; None believes nothing."""
+    leads = policy.aliases.get(alias)
+    if expected not in (None, leads):
+        now = f"leads to {leads}" if leads is not None else "is gone"
+        raise ConflictError(
+            f"the alias '{alias}' of policy '{name}' {now} and was expected at {expected}: moved already"
+        )
+
+
+def _require(name: str, policy: PolicyPlan, reference: str) -> None:
+    if policy.version_of(reference) is None:
+        what = "version" if reference[:1].isdigit() else "alias"
+        raise UnknownVersionError(
+            f"policy '{name}' has no {what} '{reference[:32]}': expected one of {_listed(policy.versions)}; "
+            f"aliases: {_listed(policy.aliases)}"
+        )
+
+
+def _sorted(digests: Mapping[str, str]) -> dict[str, str]:
+    return dict(sorted(digests.items(), key=lambda item: version_key(item[0])))
+
+
+def _listed(names: Mapping[str, Any] | list[str]) -> str:
+    return ", ".join(names) or "none"

@@ -1,8 +1,8 @@
 """Plans as numbered files in `.plan/` of a repository: created, never overwritten, read by every process.
 
-The files stand in the first of the places that can be written, a repository's folder or object storage. Where none can
-(bundle folders, http, a read-only file system), they stand in the user's state folder. Creating a file fails where it
-exists, which is all the agreement between processes that is needed.
+They are kept in the first of the places that can be written, a repository's folder or object storage. If none can
+(bundle folders, http, a read-only file system), they are kept in the user's state folder. Creating a file fails if it
+exists: processes need no other agreement.
 """
 
 from __future__ import annotations
@@ -15,71 +15,30 @@ import re
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
 
 from rlservo.export.contract.bundle import CONTRACT_FILE
 from rlservo.export.contract.contract import first_fault
 from rlservo.export.contract.errors import UnavailableError
-from rlservo.export.contract.regular_files import blocks, open_regular
 from rlservo.serve_app.repository.bundle_cache import default_folder
-from rlservo.serve_app.repository.object_storage import ObjectStorage, is_uri, place_of
-from rlservo.serve_app.repository.repository import TIMEOUT_S
+from rlservo.serve_app.repository.storage import (
+    MAX_DOCUMENT_BYTES,
+    TIMEOUT_S,
+    FolderStorage,
+    is_uri,
+    object_storage,
+    place_of,
+)
 from rlservo.serve_app.versions.serving_plan import Plan
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.repository.object_storage import ObjectStorage
 
 FOLDER = ".plan"
 FOLDER_POLL_S = 0.5
 STORAGE_POLL_S = 5.0
-MAX_PLAN_BYTES = 16 << 20  # of 1,000 policies it has 0.3 MB
-
-
-class FolderStorage:
-    """Files below a folder, by the methods of `ObjectStorage` that plans need. NFS will do."""
-
-    def __init__(self, root: Path) -> None:
-        self.uri = str(root)
-        self._root = root
-
-    def read(self, name: str, most: int) -> tuple[bytes, str]:
-        """Return a file. Raises FileNotFoundError, and UnavailableError if it cannot be read."""
-        file = self._root / name
-        try:
-            # Opening the folder has NFS ask its server what is new in it; a look for the file alone would not.
-            os.close(os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY))
-            with open_regular(file, most) as stream:
-                return b"".join(blocks(stream, most)), ""
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise UnavailableError(f"{file} cannot be read: {error.strerror or error}") from None
-
-    def create(self, name: str, content: bytes) -> bool:
-        """Write a file unless there is one; return whether it has this content now. Raises UnavailableError."""
-        file = self._root / name
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            beside = file.with_name(f".new-{secrets.token_hex(8)}")
-            try:
-                with beside.open("xb") as stream:
-                    stream.write(content)
-                    stream.flush()
-                    os.fsync(stream.fileno())
-                with contextlib.suppress(FileExistsError):
-                    os.link(beside, file)  # whole at once, and only if there is none
-            finally:
-                beside.unlink(missing_ok=True)
-        except OSError as error:
-            raise UnavailableError(f"{file} cannot be written: {error.strerror or error}") from None
-        return self.read(name, MAX_PLAN_BYTES)[0] == content
-
-    def names(self, folder: str) -> list[str]:
-        """Return the names below a folder; none if it does not exist. Raises UnavailableError."""
-        try:
-            return [file.name for file in (self._root / folder).iterdir()]
-        except FileNotFoundError:
-            return []
-        except OSError as error:
-            raise UnavailableError(f"{self._root / folder} cannot be read: {error.strerror or error}") from None
 
 
 class PlanFiles:
@@ -95,7 +54,7 @@ class PlanFiles:
     ) -> None:
         """`root` is a folder or URI for the plans instead of the places. Raises UsageError.
 
-        `cache` keeps a copy of what object storage gave last; reading or writing a plan may take `timeout_s`.
+        `cache` keeps a copy of the last plan from object storage; reading or writing a plan may take `timeout_s`.
         """
         self._places = [place_of(place) for place in places]
         self._root = None if root is None else place_of(root)
@@ -118,7 +77,7 @@ class PlanFiles:
         return self._read(max(numbers)) if numbers else None
 
     def after(self, number: int) -> Plan | None:
-        """Return the newest plan that has followed one; None where none has. Raises UnavailableError."""
+        """Return the newest plan that has followed one; None if none has. Raises UnavailableError."""
         plan = None
         while (following := self._read(number + 1)) is not None:
             plan, number = following, number + 1
@@ -133,7 +92,7 @@ class PlanFiles:
         return True
 
     def remembered(self) -> Plan | None:
-        """Return the newest plan that object storage gave this machine, for a start without it."""
+        """Return the newest plan that this machine has read from object storage, for a start without it."""
         with contextlib.suppress(OSError, ValidationError):
             if self._copy is not None:
                 return Plan.model_validate_json(self._copy.read_bytes())
@@ -142,7 +101,7 @@ class PlanFiles:
     @functools.cached_property
     def _storage(self) -> ObjectStorage | FolderStorage:
         root = self._root or _first_writable(self._places)
-        return ObjectStorage(root, timeout_s=self.timeout_s / 2) if is_uri(root) else FolderStorage(Path(root))
+        return object_storage(root, self.timeout_s) if is_uri(root) else FolderStorage(Path(root))
 
     @functools.cached_property
     def _copy(self) -> Path | None:
@@ -154,7 +113,7 @@ class PlanFiles:
     def _read(self, number: int) -> Plan | None:
         name = _name(number)
         try:
-            content, _ = self._storage.read(name, MAX_PLAN_BYTES)
+            content, _ = self._storage.read(name, MAX_DOCUMENT_BYTES)
             plan = Plan.model_validate_json(content)
         except FileNotFoundError:
             return None
@@ -165,7 +124,7 @@ class PlanFiles:
         return plan
 
     def _remember(self, content: bytes) -> None:
-        with contextlib.suppress(OSError):  # a full disk, say: then an older one stays
+        with contextlib.suppress(OSError):  # a full disk, for example: then an older copy stays
             if self._copy is not None:
                 self._copy.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 beside = self._copy.with_suffix(f".{secrets.token_hex(4)}")

@@ -1,8 +1,8 @@
-"""Versions that one process serves: it follows the plan, and takes commands that change it.
+"""Versions that one process serves: it follows the plan, and carries out commands that change it.
 
-A process swaps one store for the next and keeps the old one if it cannot follow. What touches bundles or plans
-happens in threads, with a time-out, and nothing is locked meanwhile: requests and other changes continue, also if a
-file system hangs.
+A process replaces its store as a whole, and keeps the old one if it cannot follow. Bundles and plans are read in
+threads with a time-out, and nothing is locked meanwhile: requests and other changes continue, also if a file system
+hangs.
 """
 
 from __future__ import annotations
@@ -11,18 +11,17 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import BundleError, RefusedError, RlservoError, UnavailableError
 from rlservo.serve_app.repository.remote_repository import Key
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.plan_commands import Command, Load, agrees
 from rlservo.serve_app.versions.plan_files import PlanFiles
-from rlservo.serve_app.versions.plan_writer import Change, PlanWriter
+from rlservo.serve_app.versions.plan_writer import PlanWriter
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig, timestamp
 from rlservo.serve_app.versions.version_loader import Loadable, VersionLoader
@@ -54,14 +53,10 @@ class PlanFollower:
         self._writer = PlanWriter(loader, files)
         self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
         self._failed: dict[Loadable, RlservoError] = {}  # why this process serves something older than the plan
-        self._refused: dict[Key, str] = {}  # by the last command that this process took
+        self._refused: dict[Key, str] = {}  # by the last command that this process carried out
+        self._refused_until: dict[Loadable, float] = {}  # new versions that polling leaves out for a while
         self._tried_at = 0.0
-        self._config = ServedConfig()  # which versions may be loaded without being asked for
-
-    @property
-    def place(self) -> str:
-        """Place of the plan."""
-        return self._files.place
+        self._config = ServedConfig()  # which versions polling may load
 
     @property
     def behind(self) -> tuple[str, ...]:
@@ -75,36 +70,28 @@ class PlanFollower:
         """
         self._config = ServedConfig.parse(document)
         plan = await self._writer.at_start(self._config)
-        if document and not plan_changes.agrees(plan, self._config):
+        if document and not agrees(plan, self._config):
             logger.warning(
                 "plan %d in %s (%s) differs from the configuration and is used: `rlservo policy` changes it",
                 plan.generation,
-                self.place,
+                self._files.place,
                 plan.changed_by,
             )
         await self._apply(plan)
         self._loader.proven = ()
 
-    async def load(self, name: str, version: str | None, *, what: str) -> Plan:
-        """Add a version of the repository (None: the newest) as `PlanWriter.load` does, and follow."""
-        return await self._carry_out(self._writer.load(name, version, what=what, known=self._generation()))
-
-    async def change(self, change: Change, *, what: str) -> Plan:
-        """Make a change as `PlanWriter.change` does; return the plan when this process serves it."""
-        return await self._carry_out(self._writer.change(change, what=what, known=self._generation()))
-
-    async def _carry_out(self, writing: Awaitable[Plan]) -> Plan:
+    async def give(self, command: Command, name: str, *, by: str = "") -> Plan:
+        """Carry out a command as `PlanWriter.give` does; return the plan when this process serves it."""
         self._refused = {}
         try:
-            plan = await writing
+            plan = await self._writer.give(command, name, by=by, known=self._generation())
         except RefusedError as error:
-            self._refused = {
-                (each["name"], each["version"]): each["reason"] for each in error.details.get("versions", ())
-            }
+            refused = error.details.get("versions", ())
+            self._refused = {(each["name"], each["version"]): each["reason"] for each in refused}
             raise
         self._try_again()
         await self._apply(plan)
-        self._loader.proven = ()  # the store holds what of it is served
+        self._loader.proven = ()  # the store holds those of them that are served
         return plan
 
     def _generation(self) -> int:
@@ -121,69 +108,49 @@ class PlanFollower:
             await self._apply(plan)
 
     def _try_again(self) -> bool:
-        """Forget what could not be loaded, but not what is still being waited for: a file system may hang."""
+        """Forget what could not be loaded, except versions that are still loading: a file system may hang."""
         before, self._failed = self._failed, {k: e for k, e in self._failed.items() if k[:2] in self._loader.loading}
         return self._failed != before
 
     async def poll_plan(self) -> None:
         """Follow the plans that others write, until cancelled."""
-        telling = asyncio.create_task(self._tell_newer())  # where files hang, the plan is followed all the same
+        warning = asyncio.create_task(self._warn_of_newer())  # the plan is followed even if that hangs
         try:
-            await self._follow_always()
+            await _always(self._files.poll_s, self.follow, "the plan cannot be followed")
         finally:
-            telling.cancel()
+            warning.cancel()
 
-    async def _tell_newer(self) -> None:
+    async def _warn_of_newer(self) -> None:
         with contextlib.suppress(UnavailableError):
-            listing = await self._loader.look()
-            newer = ", ".join(" ".join(key) for key in self._newer(listing.digests)[:10])
+            newer = ", ".join(" ".join(key) for key in self._newer((await self._loader.look()).digests)[:10])
             if newer:
                 number = self._generation()
                 logger.warning(
                     "newer than the versions of plan %d, and not loaded: %s (`rlservo policy load`)", number, newer
                 )
 
-    async def _follow_always(self) -> None:
-        told = ""
-        while True:
-            await asyncio.sleep(self._files.poll_s)
-            try:
-                await self.follow()
-                told = ""
-            except Exception as error:  # it may be out of reach for a while; what is served continues
-                if str(error) != told:
-                    logger.warning("the plan cannot be followed, serving continues unchanged: %s", error)
-                told = str(error)
-
     async def poll_repository(self, period_s: float) -> None:
-        """Load what is newer than all versions that the plan knows of a policy, as `load` does, until cancelled.
+        """Load versions newer than all that the plan knows of a policy, as the command `load` does, until cancelled.
 
-        What the configuration leaves out is also left out here; what an operator unloads stays unloaded.
+        Versions that the configuration leaves out are left out here, and so are those that an operator has unloaded.
         """
-        refused_until: dict[Loadable, float] = {}
-        told: set[str] = set()
-        while True:
-            await asyncio.sleep(period_s)
+        await _always(period_s, self._load_newer, "looking for new versions failed")
+
+    async def _load_newer(self) -> set[str]:
+        """Load the newer versions; return what was wrong with others."""
+        listing = await self._loader.look()
+        digests, wrong = listing.digests, {error.message for error in listing.wrong}
+        for name, version in self._newer(digests):
+            key = (name, version, digests[name, version])
+            if time.monotonic() < self._refused_until.get(key, 0.0):
+                continue
             try:
-                listing = await self._loader.look()
-                digests, wrong = listing.digests, {error.message for error in listing.wrong}
-                for name, version in self._newer(digests):
-                    key = (name, version, digests[name, version])
-                    if time.monotonic() < refused_until.get(key, 0.0):
-                        continue
-                    try:
-                        add = partial(plan_changes.load, name=name, version=version, digest=key[2])
-                        await self.change(add, what=f"poll {name} {version}")
-                    except UnavailableError as error:
-                        wrong.add(error.message)
-                    except RlservoError as error:
-                        wrong.add(error.message)
-                        refused_until[key] = time.monotonic() + REFUSED_PERIOD_S
-            except Exception as error:
-                wrong = {str(error)}
-            for sentence in sorted(wrong - told):
-                logger.warning("looking for new versions failed, serving continues unchanged: %s", sentence)
-            told = wrong
+                await self.give(Load(version=version), name, by=f"poll {name} {version}")
+            except RlservoError as error:
+                wrong.add(error.message)
+                if not isinstance(error, UnavailableError):
+                    self._refused_until[key] = time.monotonic() + REFUSED_PERIOD_S
+        return wrong
 
     def _newer(self, digests: Mapping[Key, str]) -> list[Key]:
         """Return the versions that a policy's known ones are all older than; of an unknown policy only the newest."""
@@ -201,7 +168,7 @@ class PlanFollower:
         return newer
 
     def states(self) -> dict[str, dict[str, VersionState]]:
-        """Return how every version stands that is served, should be, or was refused."""
+        """Return the state of every version that is served, should be, or was refused, by name."""
         states = {key: VersionState("failed", reason) for key, reason in self._refused.items()}
         states.update({key[:2]: VersionState("failed", error.message) for key, error in self._failed.items()})
         for name, policy in ({} if self.store is None else self.store.plans).items():
@@ -217,9 +184,9 @@ class PlanFollower:
         return by_name
 
     async def _apply(self, plan: Plan) -> None:
-        """Serve a plan: policy by policy as a whole, so that one which cannot be loaded stays as it was.
+        """Serve a plan policy by policy, each as a whole: one that cannot be loaded stays as it was.
 
-        Raises BundleError when this process serves nothing yet and a default version cannot be loaded.
+        Raises BundleError if this process serves nothing yet and a default version cannot be loaded.
         """
         self._tried_at = time.monotonic()
         found: dict[Loadable, Policy | RlservoError] = {}
@@ -234,9 +201,9 @@ class PlanFollower:
         await self._loader.touch([digest for _, _, digest in found])
 
     def _arrange(self, plan: Plan, found: Mapping[Loadable, Policy | RlservoError]) -> None:
-        """Serve a plan with what of it could be loaded. Nothing waits here: a request sees the old or the new."""
+        """Serve the part of a plan that could be loaded. Nothing waits: a request sees the old or the new store."""
         if self.plan is not None and plan.generation < self.plan.generation:
-            return  # while this one was being loaded, a later one has been served
+            return  # a later plan has been served while this one was loading
         serving: dict[str, PolicyPlan] = {}
         kept: list[Policy] = []
         for name, wanted in plan.policies.items():
@@ -251,7 +218,7 @@ class PlanFollower:
                     continue  # not served here rather than as another version; `behind` reports it
                 raise BundleError(
                     f"policy '{name}' cannot be served as version {wanted.default}, its default in plan "
-                    f"{plan.generation} of {self.place}: {errors[wanted.default].message}"
+                    f"{plan.generation} of {self._files.place}: {errors[wanted.default].message}"
                 )
             serving[name] = wanted
             kept += [policy for key in keys if (policy := self._loader.get(*key)) is not None]
@@ -265,3 +232,17 @@ class PlanFollower:
             logger.error("plan %d cannot be served as it should: %s", plan.generation, "; ".join(self.behind))
         else:
             logger.info("serving plan %d (%s)", plan.generation, plan.changed_by)
+
+
+async def _always(period_s: float, step: Callable[[], Awaitable[set[str] | None]], fault: str) -> None:
+    """Repeat a step until cancelled; log what it returns or raises, each sentence once until it is gone."""
+    logged: set[str] = set()
+    while True:
+        await asyncio.sleep(period_s)
+        try:
+            wrong = await step() or set()
+        except Exception as error:  # it may be out of reach for a while
+            wrong = {str(error)}
+        for sentence in sorted(wrong - logged):
+            logger.warning("%s, serving continues unchanged: %s", fault, sentence)
+        logged = wrong

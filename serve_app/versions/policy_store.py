@@ -10,21 +10,13 @@ import random
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, read_contract
 from rlservo.export.contract.contract import version_key
-from rlservo.export.contract.errors import (
-    StateNeededError,
-    UnknownPolicyError,
-    UnknownVersionError,
-    UsageError,
-)
+from rlservo.export.contract.errors import StateNeededError, UnknownPolicyError, UnknownVersionError, UsageError
 from rlservo.serve_app.interface import Observation
-from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.serving_plan import PolicyPlan
 
@@ -289,18 +281,3 @@ NEEDS_LAST = (
     f"has a limit on the step from one action to the next: {CARRY}, or 'last_action' (in the Open Inference Protocol "
     f"an input, or 'sequence_start' for the first), or {SESSION}"
 )
-
-
-def load_policy(
-    folder: Path,
-    *,
-    threads: int = 1,
-    options: Mapping[str, PolicyOptions] | None = None,
-    limits: BundleLimits = DEFAULT_LIMITS,
-) -> Policy:
-    """Load and prove a bundle; `options` are by policy name, '*' is for those not named. Raises BundleError."""
-    if not options:
-        return Policy.load(folder, threads=threads, limits=limits)
-    name = read_contract(folder, limits).name
-    chosen = options.get(name, options.get("*", DEFAULT_OPTIONS))
-    return Policy.load(folder, threads=threads, options=chosen, limits=limits)

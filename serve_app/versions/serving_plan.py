@@ -1,12 +1,12 @@
 """Plan of what a server serves: versions, aliases, canary and shadow of each policy.
 
-`ServedConfig` is what a person writes (Serve's `user_config`) for a repository that has no plan yet; a `Plan` is what
-came of it and of every command since: whole, numbered, the same for every process. A version in a plan carries the hash
-of the bundle that was accepted, so that no process serves another one under its name.
+A person writes a `ServedConfig` (Serve's `user_config`) for a repository that has no plan yet. A `Plan` is the result
+of it and of every command since: whole, numbered, the same for every process. A version in a plan carries the hash of
+the bundle that was accepted, so that no process serves another one under its name.
 
-Every policy of a plan has the alias `production`, which is what clients get that ask for no version; where nobody said
-so it is written down when the policy is first served. So a version that is loaded later is never in use by itself, and
-a rollback always knows what was.
+Every policy of a plan has the alias `production`, the version for clients that name none. If no one has set it, it is
+written down when the policy is first served. So a version that is loaded later is never in use by itself, and a
+rollback always knows the previous version.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _Model(BaseModel):
 
 
 class Canary(_Model):
-    """A share of what does not ask for a version goes to another one, all of a session to the same."""
+    """A share of the sessions that name no version goes to another one, each session always to the same."""
 
     version: Reference
     share: float = Field(gt=0, le=1)
@@ -75,7 +75,7 @@ class ServedConfig(_Model):
 
     @property
     def wants_all(self) -> bool:
-        """Whether something is meant by not being named, so that nothing of the repository may be missing."""
+        """Whether it also means bundles that it does not name, so that none of the repository's may be broken."""
         return self.unlisted == "load" or any(policy.versions is None for policy in self.policies.values())
 
     @classmethod
@@ -92,15 +92,15 @@ class PolicyPlan(_Model):
     """One policy of a plan."""
 
     versions: dict[Version, str]
-    """The version's bundle, as the SHA-256 of its SHA256SUMS. None at all: the policy was unloaded, and its
-    history is kept for when it is loaded again."""
+    """Each version's bundle, as the SHA-256 of its SHA256SUMS. Empty if the policy was unloaded: its history is kept
+    for when it is loaded again."""
 
     aliases: dict[Alias, Version] = {}
     history: dict[Alias, tuple[Version, ...]] = {}
     """Previous versions of an alias, the latest last."""
 
     unloaded: dict[Version, str] = {}
-    """The bundles of versions that were loaded before: a rollback leads back to the same ones, and no poll to them."""
+    """Bundles of versions that were loaded before: a rollback returns to the same ones, and polling skips them."""
 
     canary: Canary | None = None
     shadow: Reference | None = None
@@ -116,6 +116,16 @@ class PolicyPlan(_Model):
     def default(self) -> str | None:
         """The version for clients that name none; None if nothing is loaded."""
         return self.aliases.get(PRODUCTION)
+
+    @property
+    def uses(self) -> dict[str, str]:
+        """What leads to a version, in words, and the version or alias that it names."""
+        uses = {f"the alias '{alias}'": version for alias, version in self.aliases.items()}
+        if self.canary is not None:
+            uses["the canary"] = self.canary.version
+        if self.shadow is not None:
+            uses["the shadow"] = self.shadow
+        return uses
 
     def version_of(self, reference: str) -> str | None:
         """Return the version that a version or an alias means, None if there is none."""

@@ -1,4 +1,4 @@
-"""Loading and proof of versions in threads with a time-out, each version once for all who wait for it."""
+"""Loading and proof of versions in threads with a time-out, each version once for all callers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import weakref
 from collections.abc import Callable, Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any, TypeVar
 
 from rlservo.export.contract.contract import Contract
@@ -18,7 +17,9 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.repository.remote_repository import Key
-from rlservo.serve_app.repository.repository import TIMEOUT_S, Listing, Repository, raise_all
+from rlservo.serve_app.repository.repository import Listing, Repository, raise_all
+from rlservo.serve_app.repository.storage import TIMEOUT_S
+from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.serving_plan import PolicyPlan
@@ -28,25 +29,30 @@ Result = TypeVar("Result")
 
 
 class VersionLoader:
-    """Loads and proves versions while the event loop continues, also if a file system hangs.
+    """Loads and proves versions without blocking the event loop, also if a file system hangs.
 
-    A version that is still held is not loaded a second time.
+    A version that is in memory is not loaded a second time.
     """
 
     def __init__(
         self,
         repository: Repository,
-        load: Callable[[Path], Policy] = Policy.load,
+        load: Callable[..., Policy] = Policy.load,
         *,
+        options: Mapping[str, PolicyOptions] | None = None,
         timeout_s: float = TIMEOUT_S,
     ) -> None:
-        """`load` loads and proves one bundle; raises BundleError. `timeout_s` is for one look and for one version."""
+        """`load` loads and proves one bundle; raises BundleError. `timeout_s` is for one look and for one version.
+
+        `options` are by policy name, '*' is for those not named.
+        """
         self._repository = repository
         self._load_bundle = load
+        self._options = options or {}
         self._timeout_s = timeout_s
         self._calls = BlockingCalls()
         self.proven: Sequence[Policy] = ()
-        """Loaded for the last proof, and in memory until the caller or the next proof replaces them."""
+        """Loaded for the last proof, and kept in memory until the caller or the next proof replaces them."""
         self._loaded: weakref.WeakValueDictionary[Loadable, Policy] = weakref.WeakValueDictionary()
         self._tasks: dict[Loadable, asyncio.Task[Policy]] = {}
 
@@ -64,7 +70,7 @@ class VersionLoader:
         return await self._look(self._repository.look)
 
     async def touch(self, digests: Collection[str]) -> None:
-        """Keep what is served in the cache, as `Repository.touch`."""
+        """Mark bundles as used in the cache, as `Repository.touch`."""
         with contextlib.suppress(UnavailableError):
             await self._look(self._repository.touch, digests)
 
@@ -79,7 +85,7 @@ class VersionLoader:
         if policy is not None:
             return policy
         task = self._tasks.get(key)
-        if task is None:  # who else wants it meanwhile waits for the same
+        if task is None:  # other callers meanwhile wait for the same task
             what = f"loading policy '{name}' version {version}"
             task = asyncio.create_task(self._calls.run(self._load_accepted, *key, timeout_s=None, what=what))
             self._tasks[key] = task
@@ -93,10 +99,10 @@ class VersionLoader:
         return task.result()
 
     async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
-        """Load what is new or newly relied on in `policies`, and check that canary and shadow fit the default version.
+        """Load new versions of `policies` and those with an alias; check that canary and shadow fit the default one.
 
-        Raises RefusedError with all that cannot be served, and UnavailableError if it only could not be read, or not in
-        time.
+        Raises RefusedError with every version that cannot be served, and UnavailableError if it only could not be read,
+        or not in time.
         """
         held: list[Policy] = []
         failures: list[tuple[Key, RlservoError]] = []
@@ -130,13 +136,15 @@ class VersionLoader:
 
     def _load_accepted(self, name: str, version: str, digest: str) -> Policy:
         """Load the bundle that was accepted, in a thread."""
+        options = self._options.get(name, self._options.get("*"))
+        given = {} if options is None else {"options": options}
         with self._repository.fetch(name, version, digest) as folder:
             try:
-                policy = self._load_bundle(folder)
+                policy = self._load_bundle(folder, **given)
             except MemoryError:
                 raise BundleError(f"{folder} needs more memory than there is") from None
             contract = policy.contract
-            # It was not exchanged meanwhile, neither now nor when its name was read and its hash accepted.
+            # It may have been exchanged since its name was read and its hash accepted.
             if (contract.name, contract.version, policy.digest) != (name, version, digest):
                 raise BundleTamperedError(
                     f"{folder} is not the bundle that was accepted as version {version} of '{name}': export changes "
@@ -146,15 +154,13 @@ class VersionLoader:
         return policy
 
     async def _check_companions(self, name: str, policy: PolicyPlan) -> list[Policy]:
-        """Refuse a canary or shadow that reads or gives something else than the default version."""
-        held = []
-        references = {"canary": policy.canary and policy.canary.version, "shadow": policy.shadow}
-        for role, reference in references.items():
-            version = policy.version_of(reference) if reference else None
+        """Refuse a canary or shadow whose observations or actions differ from the default version's."""
+        held: list[Policy] = []
+        for role in ("canary", "shadow"):
+            version = policy.version_of(policy.uses.get(f"the {role}", ""))
             if version is None or policy.default is None:
                 continue
-            held.append(await self.load(name, version, policy.versions[version]))
-            held.append(await self.load(name, policy.default, policy.versions[policy.default]))
+            held += [await self.load(name, each, policy.versions[each]) for each in (version, policy.default)]
             theirs, ours = held[-2].contract, held[-1].contract
             if _interface(theirs) != _interface(ours):
                 raise RefusedError(
@@ -174,7 +180,7 @@ class VersionLoader:
 
 
 def _interface(contract: Contract) -> tuple[Any, ...]:
-    """Return what a caller must know of a policy: what goes in and what comes out."""
+    """Return the tensors of a policy that its callers must know."""
     inputs = tuple(tensor for tensor in contract.inputs if not tensor.name.startswith("state_in."))
     actions = tuple(tensor for tensor in contract.outputs if tensor.name.split(".")[0] == "action")
     return inputs, actions

@@ -25,7 +25,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.status_page import FOLDER
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.plan_changes import set_alias
+from rlservo.serve_app.versions.plan_commands import SetAlias
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from servers import over_uvicorn
 from stores import load_store
@@ -298,11 +298,10 @@ def test_several_replicas_are_summed_and_their_differences_said(
             tab.wait_for_text("replica-a", "replica-b", "the sum of what these said")
             tab.wait_for(f"{row('1')}.Requests === '50' && {row('1')}.State === 'ready'")
             assert one.plan is not None
-            after = set_alias(one.plan, "ur5", "production", "2")
-            asyncio.run(one.change(lambda _: after, what="alias"))
+            asyncio.run(one.give(SetAlias(alias="production", version="2"), "ur5"))
             tab.wait_for_text("Not every replica has followed the last change yet.", "(before: 1)")
             assert tab.evaluate(row("2"))["Aliases"] == "production"
-            asyncio.run(other.change(lambda _: after, what="alias"))
+            asyncio.run(other.give(SetAlias(alias="production", version="2"), "ur5"))
             tab.wait_for("!document.body.innerText.includes('Not every replica')")
             # Whichever replica is asked: no change is seen twice, or back.
             assert tab.evaluate("document.getElementById('changes').children.length") == 1

@@ -34,16 +34,16 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UsageError,
 )
-from rlservo.serve_app.repository.object_storage import ObjectStorage, place_of
+from rlservo.serve_app.repository.object_storage import ObjectStorage
 from rlservo.serve_app.repository.publication import next_version, publish
 from rlservo.serve_app.repository.remote_repository import INDEX, Index
 from rlservo.serve_app.repository.repository import Repository
-from rlservo.serve_app.repository.storage_http import request
+from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
-from rlservo.serve_app.versions import plan_changes
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
+from rlservo.serve_app.versions.plan_commands import Load, SetAlias, Unload
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan, ServedConfig
@@ -90,8 +90,8 @@ def replica(*places: str, cache: Path, timeout_s: float = 20) -> PlanFollower:
     return PlanFollower(loader, PlanFiles(places, cache=cache, timeout_s=timeout_s), replica="only")
 
 
-def aliased(version: str, alias: str = "production") -> Callable[[Plan], Any]:
-    return lambda plan: plan_changes.set_alias(plan, "ur5", alias, version)
+def aliased(version: str, alias: str = "production") -> SetAlias:
+    return SetAlias(alias=alias, version=version)
 
 
 def fetch(repository: Repository, version: str = "1") -> Path:
@@ -307,14 +307,14 @@ def test_a_storage_that_lies_is_told_in_a_sentence_and_what_runs_goes_on(
         await asyncio.to_thread(put, made, storage.uri, "2")
         storage.tell(lie)
         with pytest.raises((RefusedError, UnavailableError), match=sentence) as caught:
-            await control.load("ur5", "2", what="load")
+            await control.give(Load(version="2"), "ur5")
         assert "xxxx" not in caught.value.message and "AKIA" not in caught.value.message
         assert SECRET not in caught.value.message and "Signature" not in caught.value.message
         assert storage.proxy.sent < MOST_SENT  # who asked has hung up
         assert control.store is not None and control.store.versions("ur5") == ("1",)
         assert control.plan is not None and control.plan.generation == 1
         storage.tell(None)
-        await control.load("ur5", "2", what="load")
+        await control.give(Load(version="2"), "ur5")
         assert control.store.versions("ur5") == ("1", "2") and control.store.default("ur5") == "1"
 
     asyncio.run(run())
@@ -439,12 +439,12 @@ def test_a_plan_in_object_storage_is_followed_raced_for_and_outlives_all(
         for control in controls:
             await control.configure({})
         polls = [asyncio.create_task(control.poll_plan()) for control in controls]
-        await controls[0].change(aliased("1"), what="alias ur5 production=1")
+        await controls[0].give(aliased("1"), "ur5")
         await until(lambda: all(c.store is not None and c.store.default("ur5") == "1" for c in controls))
         storage.tell(late(0.1))
         outcomes = await asyncio.gather(
-            controls[0].change(aliased("2"), what="alias ur5 production=2"),
-            controls[1].change(aliased("3"), what="alias ur5 production=3"),
+            controls[0].give(aliased("2"), "ur5"),
+            controls[1].give(aliased("3"), "ur5"),
             return_exceptions=True,
         )
         assert sum(isinstance(outcome, ConflictError) for outcome in outcomes) == 1, outcomes
@@ -452,9 +452,9 @@ def test_a_plan_in_object_storage_is_followed_raced_for_and_outlives_all(
         await until(lambda: {c.plan.generation for c in controls if c.plan} == {3})
         storage.go_away()
         with pytest.raises(UnavailableError, match=AWAY):
-            await controls[2].change(aliased("1", "candidate"), what="alias ur5 candidate=1")
+            await controls[2].give(aliased("1", "candidate"), "ur5")
         storage.tell(None)  # it was away for a moment: that is no refusal
-        await controls[2].change(aliased("1", "candidate"), what="alias ur5 candidate=1")
+        await controls[2].give(aliased("1", "candidate"), "ur5")
         for poll in polls:
             poll.cancel()
         new = replica(storage.uri, cache=cache.parent / "another")  # a whole new cluster
@@ -474,12 +474,12 @@ def test_a_server_starts_again_with_its_storage_away(
         control = replica(storage.uri, cache=cache)
         await control.configure({"policies": {"ur5": {"versions": ["1", "2"]}}} if not away else {})
         if not away:
-            await control.change(aliased("1"), what="alias")
+            await control.give(aliased("1"), "ur5")
         assert control.store is not None and control.store.default("ur5") == "1"
         if away:
             for version in ("2", "3", None):
                 with pytest.raises(UnavailableError, match=f"policies/.* {AWAY}"):
-                    await control.load("ur5", version, what="load")
+                    await control.give(Load(version=version), "ur5")
             assert control.store.versions("ur5") == ("1", "2")
             with pytest.raises(UnavailableError, match=rf"policies/\.plan {AWAY}"):
                 await replica(storage.uri, cache=cache.parent / "empty").configure({})
@@ -669,7 +669,7 @@ def test_a_folder_is_published_to_at_once_and_served_by_path_file_uri_and_http(m
             for number, version in ((1, "2"), (2, "1")):  # the plan is in the user's state folder
                 control = replica(url, cache=cache)
                 await control.configure({})
-                plan = await control.change(aliased("1"), what="alias ur5 production=1")
+                plan = await control.give(aliased("1"), "ur5")
                 assert (plan.generation, control.store and control.store.default("ur5")) == (2, "1"), (number, version)
 
         asyncio.run(run())
@@ -742,19 +742,15 @@ def test_an_environments_proxy_is_asked_but_not_for_this_machine(monkeypatch: py
         stream(handler, {}, b"{}")
         return True
 
-    import io
-
     with shown(Path("/"), answer) as url:
         monkeypatch.setenv("http_proxy", url.replace("://", "://robot:pass%20word@"))
-        for target in ("http://policies.example/index.json", f"{url}/own.json"):
-            content = io.BytesIO()
-            assert request("GET", target, {}, b"", into=content, most=10, timeout_s=5).status == 200
-            assert content.getvalue() == b"{}"
-        with pytest.raises(ConnectionError), socket.create_server(("127.0.0.1", 0)) as nothing:
+        for target in ("http://policies.example", url):
+            assert ObjectStorage(target).read("own.json", 10)[0] == b"{}"
+        with socket.create_server(("127.0.0.1", 0)) as nothing:
             port = nothing.getsockname()[1]
-            nothing.close()
-            request("GET", f"http://127.0.0.1:{port}/", {}, b"", into=content, most=10, timeout_s=5)
-    assert asked == [("http://policies.example/index.json", "Basic cm9ib3Q6cGFzcyB3b3Jk"), ("/own.json", None)]
+        with pytest.raises(UnavailableError, match="cannot be reached or read"):
+            ObjectStorage(f"http://127.0.0.1:{port}").read("own.json", 10)
+    assert asked == [("http://policies.example/own.json", "Basic cm9ib3Q6cGFzcyB3b3Jk"), ("/own.json", None)]
 
 
 def test_polling_loads_what_is_newer_and_says_once_that_the_storage_is_away(
@@ -769,7 +765,7 @@ def test_polling_loads_what_is_newer_and_says_once_that_the_storage_is_away(
         await asyncio.to_thread(put, made, storage.uri, "1", "3")
         await until(lambda: control.store is not None and control.store.versions("ur5") == ("2", "3"))  # 1 is not newer
         assert control.store is not None and control.store.default("ur5") == "2"
-        await control.change(lambda plan: plan_changes.unload(plan, "ur5", "3"), what="unload")
+        await control.give(Unload(version="3"), "ur5")
         looks = storage.gets(INDEX)
         await until(lambda: storage.gets(INDEX) > looks + 4)
         assert control.store.versions("ur5") == ("2",)  # what an operator unloaded stays unloaded

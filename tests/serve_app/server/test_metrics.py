@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.plan_commands import Load, Unload
 from servers import exchange
 from stores import load_store
 
@@ -106,9 +105,9 @@ def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
             return {each.labels["version"]: each.value for each in families["rlservo_policy_loaded"].samples}
 
         assert loaded() == {"1": 1.0, "2": 0.0}
-        asyncio.run(control.change(partial(plan_changes.unload, name="ur5", version="2"), what="unload"))
+        asyncio.run(control.give(Unload(version="2"), "ur5"))
         assert loaded() == {"1": 1.0}
-        asyncio.run(control.load("ur5", "2", what="load"))
+        asyncio.run(control.give(Load(version="2"), "ur5"))
         assert loaded() == {"1": 1.0, "2": 0.0}
 
 

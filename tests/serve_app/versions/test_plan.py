@@ -7,15 +7,38 @@ from typing import Any
 import pytest
 
 from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
-from rlservo.serve_app.versions import plan_changes
-from rlservo.serve_app.versions.plan_changes import plan_of
+from rlservo.serve_app.versions.plan_commands import (
+    Load,
+    Rollback,
+    SetAlias,
+    SetCanary,
+    Unload,
+    agrees,
+    first_policies,
+)
 from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig
 
 AVAILABLE = {"ur5": {"1": "a", "2": "b", "10": "c"}, "mir": {"1": "d"}}
 
 
-def planned(config: dict[str, Any], before: Plan | None = None) -> dict[str, PolicyPlan]:
-    return plan_of(ServedConfig.parse(config), AVAILABLE, before)
+def planned(config: dict[str, Any]) -> dict[str, PolicyPlan]:
+    return first_policies(ServedConfig.parse(config), AVAILABLE)
+
+
+def alias(plan: Plan, name: str, alias: str, version: str | None) -> dict[str, PolicyPlan]:
+    return SetAlias(alias=alias, version=version).change(plan, name)
+
+
+def rollback(plan: Plan, expected: str | None = None) -> dict[str, PolicyPlan]:
+    return Rollback(expected=expected).change(plan, "ur5")
+
+
+def unload(plan: Plan, name: str, version: str | None) -> dict[str, PolicyPlan]:
+    return Unload(version=version).change(plan, name)
+
+
+def load(plan: Plan, name: str, version: str, digest: str) -> dict[str, PolicyPlan]:
+    return Load.of(version, digest).change(plan, name)
 
 
 def made(policies: dict[str, PolicyPlan], generation: int = 1) -> Plan:
@@ -76,25 +99,25 @@ def test_a_configuration_that_leads_nowhere_is_refused(config: Any, error: type[
 
 def test_versions_that_compare_equal_are_refused() -> None:
     with pytest.raises(ConflictError, match=r"'1' and '1\.0\.0'"):
-        plan_of(ServedConfig(), {"ur5": {"1": "a", "1.0.0": "b"}}, None)
+        first_policies(ServedConfig(), {"ur5": {"1": "a", "1.0.0": "b"}})
 
 
 def test_rollbacks_go_back_through_what_an_alias_was_and_load_what_is_gone() -> None:
     now = made(planned({"policies": {"ur5": {"aliases": {"production": "1"}}}}))
     for version in ("2", "10", "10"):
-        now = now.after(plan_changes.set_alias(now, "ur5", "production", version), "alias")
+        now = now.after(alias(now, "ur5", "production", version), "alias")
     assert now.policies["ur5"].history == {"production": ("1", "2")}
-    now = now.after(plan_changes.unload(now, "ur5", "2"), "unload")
+    now = now.after(unload(now, "ur5", "2"), "unload")
     assert now.policies["ur5"].unloaded == {"2": "b"}
-    now = now.after(plan_changes.roll_back(now, "ur5", "production"), "rollback")
+    now = now.after(rollback(now), "rollback")
     assert now.policies["ur5"].default == "2"
     assert now.policies["ur5"].versions == {"1": "a", "2": "b", "10": "c"}  # the same bundle as before
     with pytest.raises(ConflictError, match="leads to 2 and was expected at 10"):
-        plan_changes.roll_back(now, "ur5", "production", expected="10")
-    now = now.after(plan_changes.roll_back(now, "ur5", "production", expected="2"), "rollback")
+        rollback(now, expected="10")
+    now = now.after(rollback(now, expected="2"), "rollback")
     assert now.policies["ur5"].default == "1"
     with pytest.raises(ConflictError, match="has no previous version"):
-        plan_changes.roll_back(now, "ur5", "production")
+        rollback(now)
 
 
 @pytest.mark.parametrize("config", [{}, {"policies": {"ur5": {"versions": ["1", "2"]}}},
@@ -103,61 +126,44 @@ def test_what_is_in_use_at_the_start_is_written_down_and_a_load_never_changes_it
     now = made(planned(config))
     first = now.policies["ur5"].default
     assert first is not None and now.policies["ur5"].aliases["production"] == first
-    now = now.after(plan_changes.load(now, "ur5", "11", "e"), "load")
+    now = now.after(load(now, "ur5", "11", "e"), "load")
     assert now.policies["ur5"].default == first
-    now = now.after(plan_changes.set_alias(now, "ur5", "production", "11"), "alias")
-    now = now.after(plan_changes.roll_back(now, "ur5", "production"), "rollback")
+    now = now.after(alias(now, "ur5", "production", "11"), "alias")
+    now = now.after(rollback(now), "rollback")
     assert now.policies["ur5"].default == first
 
 
 def test_production_is_moved_but_neither_removed_nor_unloaded_nor_exchanged() -> None:
     now = made(planned({}))
     with pytest.raises(ConflictError, match=r"says what clients get .* point it elsewhere, or unload the policy"):
-        plan_changes.set_alias(now, "ur5", "production", None)
+        alias(now, "ur5", "production", None)
     with pytest.raises(ConflictError, match="version 10 is in use by the alias 'production'"):
-        plan_changes.unload(now, "ur5", "10")
+        unload(now, "ur5", "10")
     with pytest.raises(ConflictError, match="in use by the alias 'production', and its folder holds another bundle"):
-        plan_changes.load(now, "ur5", "10", "exchanged")
-    assert plan_changes.load(now, "ur5", "10", "c")["ur5"] == now.policies["ur5"]
-    assert plan_changes.load(now, "ur5", "2", "exchanged")["ur5"].versions["2"] == "exchanged"  # nothing leads there
+        load(now, "ur5", "10", "exchanged")
+    assert load(now, "ur5", "10", "c")["ur5"] == now.policies["ur5"]
+    assert load(now, "ur5", "2", "exchanged")["ur5"].versions["2"] == "exchanged"  # nothing leads there
 
 
 def test_a_policy_that_was_not_served_is_in_use_as_what_was_loaded_first() -> None:
     now = made(planned({"policies": {"mir": {}}, "unlisted": "ignore"}))
-    now = now.after(plan_changes.load(now, "ur5", "2", "b"), "load")
+    now = now.after(load(now, "ur5", "2", "b"), "load")
     assert now.policies["ur5"].default == "2"
-    now = now.after(plan_changes.load(now, "ur5", "10", "c"), "load")
+    now = now.after(load(now, "ur5", "10", "c"), "load")
     assert now.policies["ur5"].default == "2"
 
 
 def test_unloading_a_policy_and_loading_another_version_leaves_the_way_back() -> None:
     now = made(planned({"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}}}}))
-    now = now.after(plan_changes.set_alias(now, "ur5", "production", "2"), "alias")
-    now = now.after(plan_changes.unload(now, "ur5", None), "unload")
+    now = now.after(alias(now, "ur5", "production", "2"), "alias")
+    now = now.after(unload(now, "ur5", None), "unload")
     with pytest.raises(UnknownPolicyError, match=r"no policy 'ur5' is loaded: this server has mir$"):
         now.policy("ur5")
-    again = now.after(plan_changes.load(now, "ur5", "2", "b"), "load")
+    again = now.after(load(now, "ur5", "2", "b"), "load")
     assert again.policies["ur5"].history == {"production": ("1",)}  # what is in use is not its own way back
-    now = now.after(plan_changes.load(now, "ur5", "10", "c"), "load")
-    now = now.after(plan_changes.roll_back(now, "ur5", "production"), "rollback")
+    now = now.after(load(now, "ur5", "10", "c"), "load")
+    now = now.after(rollback(now), "rollback")
     assert now.policies["ur5"].default == "2" and now.policies["ur5"].versions == {"2": "b", "10": "c"}
-
-
-def test_a_configuration_that_does_not_say_production_leaves_it_where_it_is() -> None:
-    before = made(planned({"policies": {"ur5": {"aliases": {"production": "1"}}}}))
-    assert planned({}, before)["ur5"].default == "1"
-    assert planned({"policies": {"ur5": {"versions": ["1", "2"], "shadow": "2"}}}, before)["ur5"].default == "1"
-    gone = planned({"policies": {"ur5": {"versions": ["2", "10"]}}}, before)["ur5"]  # it cannot stay
-    assert (gone.default, gone.history, gone.unloaded) == ("10", {"production": ("1",)}, {"1": "a"})
-    ignored = made(planned({"policies": {"mir": {}}, "unlisted": "ignore"}, before))
-    assert not ignored.policies["ur5"].versions
-    assert planned({}, ignored)["ur5"].history == {"production": ("1",)}
-
-
-def test_a_new_configuration_leaves_the_way_back_open() -> None:
-    before = made(planned({"policies": {"ur5": {"aliases": {"production": "1"}}}}))
-    after = planned({"policies": {"ur5": {"versions": ["2"], "aliases": {"production": "2"}}}}, before)
-    assert after["ur5"].history == {"production": ("1",)}
 
 
 def test_what_is_in_use_is_not_unloaded() -> None:
@@ -165,24 +171,41 @@ def test_what_is_in_use_is_not_unloaded() -> None:
     ur5 = {"aliases": {"production": "1", "candidate": "2"}, "canary": canary, "shadow": "10"}
     now = made(planned({"policies": {"ur5": ur5}}))
     with pytest.raises(ConflictError, match="alias 'candidate' and the canary"):
-        plan_changes.unload(now, "ur5", "2")
+        unload(now, "ur5", "2")
     with pytest.raises(ConflictError, match="in use by the shadow"):
-        plan_changes.unload(now, "ur5", "10")
+        unload(now, "ur5", "10")
     with pytest.raises(ConflictError, match="in use by the canary: end that first"):
-        plan_changes.set_alias(now, "ur5", "candidate", None)
+        alias(now, "ur5", "candidate", None)
     with pytest.raises(ConflictError, match="the last of policy 'mir'"):
-        plan_changes.unload(now, "mir", "1")
+        unload(now, "mir", "1")
     with pytest.raises(ConflictError, match="no alias 'old': it has production, candidate"):
-        plan_changes.set_alias(now, "ur5", "old", None)
-    assert {name for name, policy in plan_changes.unload(now, "mir", None).items() if policy.versions} == {"ur5"}
+        alias(now, "ur5", "old", None)
+    assert {name for name, policy in unload(now, "mir", None).items() if policy.versions} == {"ur5"}
     with pytest.raises(UnknownVersionError, match="no version '3'"):
-        plan_changes.set_canary(now, "ur5", "3", 0.5)
+        SetCanary(version="3", share=0.5).change(now, "ur5")
 
 
 def test_a_plan_agrees_with_its_configuration_until_a_command_changes_what_that_says() -> None:
     config = ServedConfig.parse({"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}}}})
-    before = made(plan_of(config, AVAILABLE, None))
-    assert plan_changes.agrees(before, config) and plan_changes.agrees(before, ServedConfig())
-    after = before.after(plan_changes.set_alias(before, "ur5", "production", "2"), "alias")
-    assert not plan_changes.agrees(after, config)
-    assert not plan_changes.agrees(after, ServedConfig.parse({"policies": {"ur5": {"versions": ["3"]}}}))
+    before = made(first_policies(config, AVAILABLE))
+    assert agrees(before, config)
+    after = before.after(alias(before, "ur5", "production", "2"), "alias")
+    assert not agrees(after, config)
+    assert not agrees(after, ServedConfig.parse({"policies": {"ur5": {"versions": ["3"]}}}))
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        ({}, True),  # it does not name production: that stays where it is
+        ({"policies": {"ur5": {"versions": ["1", "2"], "shadow": "2"}}}, True),
+        ({"policies": {"ur5": {"versions": ["2"]}}}, False),
+        ({"policies": {"ur5": {"shadow": "1"}}}, False),
+        ({"policies": {"ur5": {"aliases": {"candidate": "2"}, "shadow": "2"}}}, False),
+        ({"policies": {"mir": {}}, "unlisted": "ignore"}, False),
+    ],
+)
+def test_a_configuration_says_nothing_about_what_it_does_not_name(config: dict[str, Any], expected: bool) -> None:
+    ur5 = {"versions": ["1", "2"], "aliases": {"production": "1"}, "shadow": "2" if config else None}
+    plan = made(planned({"policies": {"ur5": ur5}, "unlisted": "ignore"}))
+    assert agrees(plan, ServedConfig.parse(config)) is expected

@@ -24,10 +24,10 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.versions import plan_changes
+from rlservo.serve_app.versions.plan_commands import Load, Rollback, SetAlias, SetCanary, SetShadow, Unload
 from rlservo.serve_app.versions.plan_files import FOLDER, PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.plan_writer import Change, PlanWriter
+from rlservo.serve_app.versions.plan_writer import PlanWriter
 from rlservo.serve_app.versions.serving_plan import Plan
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
@@ -70,8 +70,8 @@ def config(*versions: str, production: str, **more: Any) -> dict[str, Any]:
     }
 
 
-def aliasing(version: str, alias: str = "production") -> Change:
-    return lambda before: plan_changes.set_alias(before, "ur5", alias, version)
+def aliasing(version: str, alias: str = "production") -> SetAlias:
+    return SetAlias(alias=alias, version=version)
 
 
 @pytest.fixture
@@ -98,8 +98,8 @@ def test_a_change_is_served_by_who_took_it_when_it_answers_and_by_the_others_wit
         first, second, third = fleet.controls
         polls = [asyncio.create_task(control.poll_plan()) for control in (second, third)]
         held = second.store
-        await first.load("ur5", "2", what="load ur5 2")
-        plan = await first.change(aliasing("2"), what="alias ur5 production=2")
+        await first.give(Load(version="2"), "ur5")
+        plan = await first.give(aliasing("2"), "ur5")
         assert fleet.defaults()[0] == "2" and first.plan == plan and plan.generation == 3
         began = asyncio.get_running_loop().time()
         await until(lambda: fleet.defaults() == ["2", "2", "2"])
@@ -127,7 +127,7 @@ def test_of_two_operators_at_once_one_wins_and_the_other_is_told(folder: Path, t
         versions = ("2", "10", "10")  # two of the three want the same
         outcomes = await asyncio.gather(
             *(
-                control.change(aliasing(version), what=f"alias ur5 production={version}")
+                control.give(aliasing(version), "ur5")
                 for control, version in zip(fleet.controls, versions, strict=True)
             ),
             return_exceptions=True,
@@ -150,14 +150,9 @@ def test_two_operators_that_roll_back_at_once_go_back_once(folder: Path, tmp_pat
         fleet = Fleet(tmp_path, folder, folder)
         await fleet.deploy(config("1", "2", "10", production="1"))
         for version in ("2", "10"):
-            await fleet.controls[0].change(aliasing(version), what="alias")
+            await fleet.controls[0].give(aliasing(version), "ur5")
         await fleet.follow()
-        await asyncio.gather(
-            *(
-                c.change(lambda p: plan_changes.roll_back(p, "ur5", "production"), what="rollback")
-                for c in fleet.controls
-            )
-        )
+        await asyncio.gather(*(control.give(Rollback(), "ur5") for control in fleet.controls))
         await fleet.follow()
         assert fleet.defaults() == ["2", "2"] and fleet.numbers() == {4}
 
@@ -170,10 +165,10 @@ def test_changes_of_different_things_at_once_are_all_made(folder: Path, tmp_path
         await fleet.deploy({})
         first, second = fleet.controls
         await asyncio.gather(
-            first.change(aliasing("1", "candidate"), what="alias"),
-            second.change(aliasing("2", "old"), what="alias"),
-            first.change(lambda p: plan_changes.set_shadow(p, "ur5", "2"), what="shadow"),
-            second.change(lambda p: plan_changes.set_alias(p, "gridworld", "candidate", "1"), what="alias"),
+            first.give(aliasing("1", "candidate"), "ur5"),
+            second.give(aliasing("2", "old"), "ur5"),
+            first.give(SetShadow(version="2"), "ur5"),
+            second.give(aliasing("1", "candidate"), "gridworld"),
         )
         await fleet.follow()
         assert fleet.numbers() == {5}
@@ -193,13 +188,13 @@ def test_a_version_that_fails_is_refused_before_anything_is_written(folder: Path
         (control,) = fleet.controls
         break_weights(folder, "2")
         with pytest.raises(RefusedError, match=r"nothing has changed: .*policy.onnx is not the file") as caught:
-            await control.load("ur5", "2", what="load ur5 2")
+            await control.give(Load(version="2"), "ur5")
         assert caught.value.details["versions"][0]["version"] == "2"
         assert fleet.numbers() == {1} and len(list((folder / FOLDER).iterdir())) == 1
         assert control.states()["ur5"]["1"].state == "ready" and control.states()["ur5"]["1"].loaded_at is not None
         with pytest.raises(ConflictError):
-            await control.change(lambda p: plan_changes.unload(p, "ur5", "1"), what="unload")
-        await control.change(aliasing("1"), what="alias ur5 production=1")  # as it is: nothing to write
+            await control.give(Unload(version="1"), "ur5")
+        await control.give(aliasing("1"), "ur5")  # as it is: nothing to write
         assert fleet.numbers() == {1} and len(list((folder / FOLDER).iterdir())) == 1
 
     asyncio.run(run())
@@ -221,7 +216,7 @@ def test_golden_vectors_that_are_not_reproduced_refuse_a_version(
         fleet = Fleet(folder, folder)
         await fleet.deploy(config("10", production="10"))
         with pytest.raises(RefusedError, match="golden"):
-            await fleet.controls[0].load("ur5", "11", what="load")
+            await fleet.controls[0].give(Load(version="11"), "ur5")
 
     asyncio.run(run())
 
@@ -242,7 +237,7 @@ def test_a_configuration_begins_a_plan_and_commands_rule_after(
             assert not (tmp_path / FOLDER).exists()
         await fleet.deploy(config("1", "10", production="1"))
         assert "differs from the configuration" not in caplog.text
-        await fleet.controls[0].change(aliasing("10"), what="alias ur5 production=10")
+        await fleet.controls[0].give(aliasing("10"), "ur5")
         whole_new_cluster = [fleet.start(folder, f"new{n}") for n in range(2)]
         for control in whole_new_cluster:
             await control.configure(config("1", "10", production="1"))
@@ -277,8 +272,8 @@ def test_a_process_that_cannot_follow_keeps_what_it_had_and_tells_why(
     async def run() -> None:
         fleet = Fleet(tmp_path, folder, elsewhere)
         await fleet.deploy(config("1", production="1"))
-        await fleet.controls[0].load("ur5", "2", what="load")
-        await fleet.controls[0].change(aliasing("2"), what="alias")
+        await fleet.controls[0].give(Load(version="2"), "ur5")
+        await fleet.controls[0].give(aliasing("2"), "ur5")
         await fleet.follow()
         assert fleet.defaults() == ["2", "1"] and fleet.numbers() == {3}
         behind = fleet.controls[1]
@@ -311,7 +306,7 @@ def test_the_same_version_is_the_same_bundle_in_every_process(
         await restarted.configure(document)
         assert restarted.store is not None and restarted.store.versions("ur5") == ("1",)
         assert "is not the bundle that was accepted" in restarted.states()["ur5"]["2"].reason
-        await fleet.controls[0].load("ur5", "2", what="load")  # now it is
+        await fleet.controls[0].give(Load(version="2"), "ur5")  # now it is
         reloaded = fleet.controls[0].store
         assert reloaded is not None and not np.allclose(reloaded.act("ur5", "2", OBS).action, action)
 
@@ -341,9 +336,9 @@ def test_canary_and_shadow_have_to_read_and_give_the_same(
         await fleet.deploy(config("1", "12", production="1"))
         control = fleet.controls[0]
         with pytest.raises(RefusedError, match=r"version 12 cannot be the canary of version 1"):
-            await control.change(lambda p: plan_changes.set_canary(p, "ur5", "12", 0.5), what="canary")
+            await control.give(SetCanary(version="12", share=0.5), "ur5")
         with pytest.raises(RefusedError, match=r"version 12 cannot be the shadow of version 1"):
-            await control.change(lambda p: plan_changes.set_shadow(p, "ur5", "12"), what="shadow")
+            await control.give(SetShadow(version="12"), "ur5")
         assert fleet.numbers() == {1}
 
     asyncio.run(run())
@@ -361,7 +356,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
     async def run() -> None:
         control = PlanFollower(VersionLoader(Repository([folder]), slowly), PlanFiles([folder]), replica="slow")
         await control.configure(config("1", production="1"))
-        change = asyncio.create_task(control.load("ur5", "2", what="load"))
+        change = asyncio.create_task(control.give(Load(version="2"), "ur5"))
         while not began.is_set():
             await asyncio.sleep(0.01)
         assert control.states()["ur5"]["2"].state == "loading"
@@ -387,10 +382,10 @@ def test_a_version_that_takes_too_long_is_there_when_it_is_asked_for_again(folde
         control = PlanFollower(loader, PlanFiles([folder]))
         await control.configure(config("1", production="1"))
         with pytest.raises(UnavailableError, match=r"loading policy 'ur5' version 2 took longer than 0.5 s"):
-            await control.load("ur5", "2", what="load")
+            await control.give(Load(version="2"), "ur5")
         go_on.set()
         await until(lambda: not loader.loading)
-        await control.load("ur5", "2", what="load")
+        await control.give(Load(version="2"), "ur5")
         assert [path.name for path in loads] == ["1", "2"]
 
     asyncio.run(run())
@@ -407,7 +402,7 @@ def test_names_and_versions_do_not_leave_the_repository(folder: Path, tmp_path: 
 def test_nothing_changes_before_the_policies_are_loaded(folder: Path) -> None:
     async def run() -> None:
         with pytest.raises(UnavailableError, match="still being loaded"):
-            await Fleet(folder, folder).controls[0].change(aliasing("1"), what="alias")
+            await Fleet(folder, folder).controls[0].give(aliasing("1"), "ur5")
 
     asyncio.run(run())
 
@@ -417,14 +412,14 @@ def test_a_command_without_a_server_begins_the_plan_that_servers_then_serve(fold
         def writer() -> PlanWriter:
             return PlanWriter(VersionLoader(Repository([folder])), PlanFiles([folder]))
 
-        plan = await writer().change(aliasing("1"), what="alias ur5 production=1")
+        plan = await writer().give(aliasing("1"), "ur5")
         assert plan.generation == 1 and plan.policies["ur5"].history == {"production": ("10",)}
         fleet = Fleet(folder, folder)
         await fleet.deploy({})
         assert fleet.defaults() == ["1"]
         break_weights(folder, "2")
         with pytest.raises(RefusedError, match=r"policy\.onnx is not the file"):
-            await writer().change(aliasing("2"), what="alias ur5 production=2")
+            await writer().give(aliasing("2"), "ur5")
         await fleet.follow()
         assert fleet.numbers() == {1}
 
@@ -447,9 +442,9 @@ def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
         following.unlink()
         shutil.move(tmp_path / FOLDER, tmp_path / "away")
         with pytest.raises(UnavailableError, match="has lost plan 1, which is served here"):
-            await control.change(aliasing("1", "candidate"), what="alias")
+            await control.give(aliasing("1", "candidate"), "ur5")
         shutil.move(tmp_path / "away", tmp_path / FOLDER)
-        await control.change(aliasing("1", "candidate"), what="alias")
+        await control.give(aliasing("1", "candidate"), "ur5")
         poll.cancel()
 
     asyncio.run(run())
