@@ -85,8 +85,7 @@ def load(
 ) -> None:
     """Load and prove a version, without using it.
 
-    What clients get stays as it is until then; of a policy that is not served at all, the version loaded first is in
-    use at once.
+    Clients keep the version that they get. If the policy is not served yet, the version loaded first is in use at once.
 
     Example: `rlservo policy load ur5 4`
     """

@@ -64,7 +64,7 @@ class ObjectStorage:
         self._client: Any = None
 
     def read(self, name: str, most: int) -> tuple[bytes, str]:
-        """Return an object and its tag for `replace`.
+        """Return an object and its tag for `create`.
 
         Raises FileNotFoundError, UnavailableError, and BundleError beyond `most` bytes.
         """
@@ -79,16 +79,21 @@ class ObjectStorage:
             raise FileNotFoundError(f"{self.uri}/{name}")
         return self._succeeded(reply, name)
 
-    def create(self, name: str, content: bytes) -> bool:
+    def create(self, name: str, content: bytes, tag: str = "") -> bool:
         """Write an object unless there is one; return whether it holds this content now, no matter who wrote it.
 
-        Raises UnavailableError, also if the storage does not keep what it was given.
+        With a `tag` it replaces the object that was read with it, if no one has changed that since. Raises
+        UnavailableError, also if the storage does not keep what it was given.
         """
-        return self._write(name, content, {"IfNoneMatch": "*"})
-
-    def replace(self, name: str, content: bytes, tag: str) -> bool:
-        """Write an object that has not changed since it was read; return and raise what `create` does."""
-        return self._write(name, content, {"IfMatch": tag})
+        reply = self._call("put_object", name, {"IfMatch": tag} if tag else {"IfNoneMatch": "*"}, content)
+        if reply.status not in (409, 412):  # there is one, or another write was under way
+            self._succeeded(reply, name)
+        try:  # it may be ours: the reply to a first attempt was lost; and a storage may keep something else
+            return self.read(name, len(content))[0] == content
+        except BundleError:
+            return False
+        except FileNotFoundError:
+            raise UnavailableError(f"{self.uri}/{name} is not there after it was written") from None
 
     def names(self, folder: str) -> list[str]:
         """Return the names of all objects below a folder. Raises UnavailableError."""
@@ -105,17 +110,6 @@ class ObjectStorage:
             if "<IsTruncated>true" not in text:
                 return found
         raise UnavailableError(f"{self.uri}/{folder} has more than {len(found):,} objects")
-
-    def _write(self, name: str, content: bytes, condition: dict[str, str]) -> bool:
-        reply = self._call("put_object", name, condition, content)
-        if reply.status not in (409, 412):  # there is one, or another write was under way
-            self._succeeded(reply, name)
-        try:  # it may be ours: the reply to a first attempt was lost; and a storage may keep something else
-            return self.read(name, len(content))[0] == content
-        except BundleError:
-            return False
-        except FileNotFoundError:
-            raise UnavailableError(f"{self.uri}/{name} is not there after it was written") from None
 
     def _call(
         self,

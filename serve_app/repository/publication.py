@@ -22,7 +22,6 @@ from rlservo.export.contract.contract import VERSION_PATTERN, version_key
 from rlservo.export.contract.errors import BundleError, ConflictError, UnavailableError, UsageError
 from rlservo.serve_app.repository.remote_repository import INDEX, Index, check_file_type
 from rlservo.serve_app.repository.storage import (
-    MAX_DOCUMENT_BYTES,
     TIMEOUT_S,
     FolderStorage,
     is_uri,
@@ -82,15 +81,7 @@ def _files(bundle: Bundle) -> Iterator[tuple[str, bytes]]:
 def _publish_to_storage(bundle: Bundle, storage: ObjectStorage, progress: Callable[[str], object]) -> None:
     if storage.is_read_only:
         raise UsageError(f"{storage.uri} can only be read: publish to a folder that its server shows, or to s3://")
-
-    def read_index() -> tuple[Index, str]:
-        try:
-            content, tag = storage.read(INDEX, MAX_DOCUMENT_BYTES)
-        except FileNotFoundError:
-            return Index(), ""
-        return Index.parse(content, f"{storage.uri}/{INDEX}"), tag
-
-    _with(read_index()[0], bundle, storage.uri)
+    _with(Index.read(storage)[0], bundle, storage.uri)
     for file, content in _files(bundle):
         name = f"{_name_of(bundle)}/{file}"
         progress(f"{storage.uri}/{name}")
@@ -100,38 +91,42 @@ def _publish_to_storage(bundle: Bundle, storage: ObjectStorage, progress: Callab
                 "another command, or was left unfinished; publish as another version (--version next)"
             )
     for attempt in range(ATTEMPTS):
-        index, tag = read_index()
-        if attempt and index.policies.get(bundle.contract.name, {}).get(bundle.contract.version) == bundle.digest:
+        index, tag = Index.read(storage)
+        if attempt and _published(index, bundle) == bundle.digest:
             return  # ours was written, and replaced by another publisher's at once
-        content = _with(index, bundle, storage.uri)
-        if storage.replace(INDEX, content, tag) if tag else storage.create(INDEX, content):
+        if storage.create(INDEX, _with(index, bundle, storage.uri), tag):
             return
         time.sleep(0.05 * attempt)
     raise UnavailableError(f"{storage.uri}/{INDEX}: others keep publishing; run the same command again")
 
 
-def _with(index: Index, bundle: Bundle, place: object) -> bytes:
+def _with(index: Index | None, bundle: Bundle, place: object) -> bytes:
     """Return the content of an index with one more line. Raises ConflictError if the version has one."""
-    policies = {name: dict(versions) for name, versions in index.policies.items()}
-    there = policies.setdefault(bundle.contract.name, {}).setdefault(bundle.contract.version, bundle.digest)
-    if policies == index.policies or there != bundle.digest:
+    if there := _published(index, bundle):
         which = "this very bundle" if there == bundle.digest else "another bundle"
         raise ConflictError(
             f"{place}/{_name_of(bundle)} is there already ({which}): versions are never overwritten; publish as "
             "another (--version next)"
         )
+    policies = {} if index is None else dict(index.policies)
+    name, version = bundle.contract.name, bundle.contract.version
+    policies[name] = {**policies.get(name, {}), version: bundle.digest}
     return Index(policies=policies).model_dump_json(indent=1).encode() + b"\n"
 
 
+def _published(index: Index | None, bundle: Bundle) -> str | None:
+    """Return the hash under which a bundle's version is published."""
+    return index and index.policies.get(bundle.contract.name, {}).get(bundle.contract.version)
+
+
 def _publish_to_folder(bundle: Bundle, root: Path) -> None:
-    """Publish where a whole folder takes its name at once; `rlservo serve` reads it as any other folder."""
+    """Publish into a folder, which takes its name when it is complete; `rlservo serve` reads it as any other."""
     target = root / _name_of(bundle)
     target.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(root, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
-        index = Index.parse((root / INDEX).read_bytes(), str(root / INDEX)) if (root / INDEX).exists() else Index()
-        content = _with(index, bundle, root)
+        content = _with(Index.read(FolderStorage(root))[0], bundle, root)
         with tempfile.TemporaryDirectory(prefix=".publishing-", dir=target.parent) as name:
             folder = Path(name) / target.name
             folder.mkdir()

@@ -13,7 +13,7 @@ import contextlib
 import json
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -21,7 +21,10 @@ from rlservo.export.contract.bundle import DEFAULT_LIMITS, MAX_FILES, MAX_SUMS_B
 from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault
 from rlservo.export.contract.errors import BundleError, BundleTamperedError
 from rlservo.serve_app.repository.bundle_cache import BundleCache
-from rlservo.serve_app.repository.storage import MAX_DOCUMENT_BYTES, object_storage
+from rlservo.serve_app.repository.storage import MAX_DOCUMENT_BYTES, FolderStorage, object_storage
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.repository.object_storage import ObjectStorage
 
 Key = tuple[str, str]  # (name, version)
 INDEX = "index.json"
@@ -40,6 +43,15 @@ class Index(BaseModel):
         Annotated[str, Field(pattern=NAME_PATTERN)],
         dict[Annotated[str, Field(pattern=VERSION_PATTERN)], Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]],
     ] = {}
+
+    @classmethod
+    def read(cls, storage: ObjectStorage | FolderStorage) -> tuple[Index | None, str]:
+        """Return a storage's index, None if it has none, and the tag. Raises BundleError, UnavailableError."""
+        try:
+            content, tag = storage.read(INDEX, MAX_DOCUMENT_BYTES)
+        except FileNotFoundError:
+            return None, ""
+        return cls.parse(content, f"{storage.uri}/{INDEX}"), tag
 
     @classmethod
     def parse(cls, content: bytes, place: str) -> Index:
@@ -65,10 +77,9 @@ class RemoteRepository:
 
     def versions(self) -> dict[Key, str]:
         """Return the hash of every published version. Raises UnavailableError, and BundleError if there is none."""
-        try:
-            index = Index.parse(self._storage.read(INDEX, MAX_DOCUMENT_BYTES)[0], f"{self.uri}/{INDEX}")
-        except FileNotFoundError:
-            raise BundleError(f"{self.uri} has no {INDEX}: nothing was published there (`rlservo publish`)") from None
+        index, _ = Index.read(self._storage)
+        if index is None:
+            raise BundleError(f"{self.uri} has no {INDEX}: nothing was published there (`rlservo publish`)")
         return {(name, version): digest for name, each in index.policies.items() for version, digest in each.items()}
 
     @contextlib.contextmanager
