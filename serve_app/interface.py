@@ -11,6 +11,9 @@ from typing_extensions import Self
 
 from rlservo.export.contract.contract import Contract
 
+PRODUCTION = "production"
+"""Alias of the version that clients get by default."""
+
 Observation: TypeAlias = ArrayLike | Mapping[str, Any] | tuple[Any, ...]
 """An array of the observation space's shape, a batch of them, a map from element name to value (or batch), or for a
 nested space maps and tuples of such."""

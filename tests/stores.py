@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from rlservo.export.contract.contract import version_key
+from rlservo.serve_app.interface import PRODUCTION
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import PRODUCTION, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.serving_plan import PolicyPlan, ServedConfig
 
 
 def load_store(*folders: Path, options: Mapping[str, PolicyOptions] | None = None) -> PolicyStore:

@@ -18,8 +18,8 @@ from rlservo.deploy.cockpit.policies import Choice, PolicySource
 from rlservo.deploy.cockpit.watch import WatchPanel
 from rlservo.deploy.terminal import ctrl_c_sets
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
+from rlservo.serve_app.interface import PRODUCTION
 from rlservo.serve_app.recording.recorder import Recorder
-from rlservo.serve_app.versions.serving_plan import PRODUCTION
 
 OnReady = Callable[[str], None]
 

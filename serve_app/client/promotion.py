@@ -1,8 +1,8 @@
 """Promotion of a version: a canary that is watched, and then put into production or ended.
 
 It uses the commands that operators use and the metrics that Prometheus reads, and keeps nothing on the server. Its
-state is its log: it is written there before each step, so that the same promotion started again continues.
-Changes that others make to the policy meanwhile stay: then it stops, and undoes no more than its own changes.
+state is its log, written before each step, so that the same command continues after a kill. If another operator
+changes the policy meanwhile, it stops and undoes only its own changes.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from rlservo.export.contract.errors import ConflictError, RlservoError, Unavaila
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.promotion_evidence import Counts, Limits, Process, UntrustedError, figures, read_metrics
 from rlservo.serve_app.client.promotion_log import END, PromotionLog
+from rlservo.serve_app.interface import PRODUCTION
 
-PRODUCTION = "production"
 PATIENCE_S = 60.0  # with a server that is unreachable, or a process that does not follow
 MOST_CHECKS = 1000  # in a log, of one promotion
 

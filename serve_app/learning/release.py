@@ -22,9 +22,10 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.export.export_checkpoint import export_checkpoint, silent
 from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.client.promotion import INTERRUPTED, PRODUCTION, PROMOTED, ROLLED_BACK, Promotion, Terms
+from rlservo.serve_app.client.promotion import INTERRUPTED, PROMOTED, ROLLED_BACK, Promotion, Terms
 from rlservo.serve_app.client.promotion_evidence import Limits
 from rlservo.serve_app.client.promotion_log import PromotionLog
+from rlservo.serve_app.interface import PRODUCTION
 from rlservo.serve_app.learning.admission import KnownVersion, Reward, named_reward
 from rlservo.serve_app.learning.run_folder import RunFolder
 from rlservo.serve_app.recording.policy_format import PolicyFormat

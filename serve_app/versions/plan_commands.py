@@ -19,8 +19,8 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UnknownVersionError,
 )
+from rlservo.serve_app.interface import PRODUCTION
 from rlservo.serve_app.versions.serving_plan import (
-    PRODUCTION,
     Alias,
     Canary,
     Plan,

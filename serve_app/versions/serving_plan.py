@@ -20,8 +20,8 @@ from typing_extensions import Self
 
 from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault, version_key
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
+from rlservo.serve_app.interface import PRODUCTION
 
-PRODUCTION = "production"
 ALIAS_PATTERN = r"^[a-z][a-z0-9_-]{0,31}$"
 
 

@@ -21,6 +21,7 @@ from rlservo.export.renumber_bundle import renumber
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.remote_policy import RemotePolicy
 from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.serve_app.interface import PRODUCTION
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.rollout.fallback import WithFallback
@@ -29,7 +30,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import PRODUCTION, Canary, PolicyPlan
+from rlservo.serve_app.versions.serving_plan import Canary, PolicyPlan
 
 OBS = np.linspace(-1, 1, 27).astype(np.float32)
 CLIENTS = pytest.mark.parametrize("kind", [PolicyClient, StreamClient])

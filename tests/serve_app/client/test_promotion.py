@@ -23,7 +23,6 @@ import pytest
 from gymnasium.envs.registration import register, registry
 
 from rlservo.export.contract.errors import ObservationError, UsageError
-from rlservo.serve_app.client import promotion
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.promotion import (
@@ -43,7 +42,6 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions import serving_plan
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 Serve = Callable[[Any], AbstractContextManager[int]]
@@ -792,8 +790,3 @@ def test_a_clock_that_was_set_meanwhile_adds_no_time(
     outcome = promotion(*steps, lambda: pytest.fail("it goes on indefinitely"))
     assert any(f"continues: {left}" in line for line in promotion.said), promotion.said
     assert outcome.outcome == (PROMOTED if jump_s < 0 else ROLLED_BACK) and server.plan.canary is None
-
-
-def test_the_alias_that_a_promotion_moves_is_the_one_that_servers_follow() -> None:
-    """Two constants: the client imports nothing of the server."""
-    assert promotion.PRODUCTION == serving_plan.PRODUCTION
