@@ -54,6 +54,10 @@ class Command(BaseModel):
 
     def change(self, plan: Plan, name: str) -> Policies:
         """Return the policies after it. Raises UnknownPolicyError, UnknownVersionError, ConflictError, RequestError."""
+        return {**plan.policies, name: self.changed(name, plan.policy(name))}
+
+    def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
+        """Return the policy after it, as `change` does."""
         raise NotImplementedError
 
 
@@ -80,14 +84,17 @@ class Load(Command):
         return command
 
     def change(self, plan: Plan, name: str) -> Policies:
-        policy, version = plan.policies.get(name) or PolicyPlan(versions={}), str(self.version)
+        return {**plan.policies, name: self.changed(name, plan.policies.get(name) or PolicyPlan(versions={}))}
+
+    def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
+        version = str(self.version)
         uses = _uses(policy, version)
         if uses and policy.versions[version] != self._digest:
             raise ConflictError(
                 f"policy '{name}' version {version} is in use by {uses}, and its folder holds another bundle by now: "
                 "export changes under a new version, or point that elsewhere first"
             )
-        return _with(plan, name, policy, versions={**policy.versions, version: self._digest})
+        return _changed(name, policy, versions={**policy.versions, version: self._digest})
 
 
 class Unload(Command):
@@ -99,16 +106,16 @@ class Unload(Command):
     def words(self) -> str:
         return self.version or ""
 
-    def change(self, plan: Plan, name: str) -> Policies:
-        policy, version = plan.policy(name), self.version
+    def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
+        version = self.version
         if version is None:  # its history stays: a rollback after it is loaded again still knows what was in use
-            return _with(plan, name, policy, versions={}, aliases={}, canary=None, shadow=None)
+            return _changed(name, policy, versions={}, aliases={}, canary=None, shadow=None)
         _require(name, policy, version)
         if len(policy.versions) == 1:
             raise ConflictError(f"version {version} is the last of policy '{name}': unload the policy itself")
         if uses := _uses(policy, version):
             raise ConflictError(f"policy '{name}' version {version} is in use by {uses}: point that elsewhere first")
-        return _with(plan, name, policy, versions={v: each for v, each in policy.versions.items() if v != version})
+        return _changed(name, policy, versions={v: each for v, each in policy.versions.items() if v != version})
 
 
 class SetAlias(Command):
@@ -127,13 +134,13 @@ class SetAlias(Command):
     def words(self) -> str:
         return f"{self.alias}={self.version or ''}"
 
-    def change(self, plan: Plan, name: str) -> Policies:
-        policy, alias = plan.policy(name), self.alias
+    def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
+        alias = self.alias
         if policy.aliases.get(alias) != self.version:
             _expect(policy, name, alias, self.expected)
         if self.version is not None:
             _require(name, policy, self.version)
-            return _with(plan, name, policy, aliases={**policy.aliases, alias: self.version})
+            return _changed(name, policy, aliases={**policy.aliases, alias: self.version})
         if alias not in policy.aliases:
             raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(policy.aliases)}")
         if alias == PRODUCTION:
@@ -144,7 +151,7 @@ class SetAlias(Command):
         for use, reference in policy.uses.items():
             if reference == alias:
                 raise ConflictError(f"the alias '{alias}' of policy '{name}' is in use by {use}: end that first")
-        return _with(plan, name, policy, aliases={a: v for a, v in policy.aliases.items() if a != alias})
+        return _changed(name, policy, aliases={a: v for a, v in policy.aliases.items() if a != alias})
 
 
 class Rollback(Command):
@@ -161,16 +168,15 @@ class Rollback(Command):
     def words(self) -> str:
         return self.alias
 
-    def change(self, plan: Plan, name: str) -> Policies:
-        policy, alias = plan.policy(name), self.alias
+    def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
+        alias = self.alias
         _expect(policy, name, alias, self.expected)
         *earlier, version = policy.history.get(alias, ()) or ("",)
         if not version:
             raise ConflictError(f"the alias '{alias}' of policy '{name}' has no previous version to roll back to")
         versions = {version: policy.unloaded.get(version, ""), **policy.versions}
-        changed = _with(plan, name, policy, versions=versions, aliases={**policy.aliases, alias: version})
-        history = {**changed[name].history, alias: tuple(earlier)}
-        return {**changed, name: changed[name].model_copy(update={"history": history})}
+        changed = _changed(name, policy, versions=versions, aliases={**policy.aliases, alias: version})
+        return changed.model_copy(update={"history": {**changed.history, alias: tuple(earlier)}})
 
 
 class SetCanary(Command):
@@ -183,11 +189,11 @@ class SetCanary(Command):
     def words(self) -> str:
         return f"{self.version or 'off'} {self.share or ''}".strip()
 
-    def change(self, plan: Plan, name: str) -> Policies:
+    def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
         if self.version is not None and self.share is None:
             raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
         canary = Canary(version=self.version, share=self.share) if self.version and self.share else None
-        return _with(plan, name, plan.policy(name), canary=canary)
+        return _changed(name, policy, canary=canary)
 
 
 class SetShadow(Command):
@@ -199,8 +205,8 @@ class SetShadow(Command):
     def words(self) -> str:
         return self.version or "off"
 
-    def change(self, plan: Plan, name: str) -> Policies:
-        return _with(plan, name, plan.policy(name), shadow=self.version)
+    def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
+        return _changed(name, policy, shadow=self.version)
 
 
 KINDS: tuple[type[Command], ...] = (Load, Unload, SetAlias, Rollback, SetCanary, SetShadow)
@@ -282,10 +288,6 @@ def differences(before: Mapping[str, PolicyPlan], after: Mapping[str, PolicyPlan
             if getattr(was, field) != getattr(now, field):
                 changed[name, field, ""] = getattr(now, field)
     return changed
-
-
-def _with(plan: Plan, name: str, policy: PolicyPlan, **changes: Any) -> Policies:
-    return {**plan.policies, name: _changed(name, policy, **changes)}
 
 
 def _changed(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
