@@ -1,4 +1,4 @@
-"""The command `rlservo policy promote`: a canary that decides; the work is in serve_app/client/promotion.py."""
+"""The command `rlservo policy promote`; the work is in serve_app/client/promotion.py."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def promote(
 ) -> None:
     """Watch a canary, then promote it or roll it back.
 
-    A share of the sessions gets the version, and the servers' metrics decide: it is rolled back at once when a limit is
-    surely exceeded, when metrics fall or contradict themselves, and when they cannot be read for a minute; and when the
-    time is over and a limit is exceeded or there is too little to judge. Exit code: 0 promoted, 1 rolled back, 4
-    stopped because another command changed what is served or the server is unreachable, 2 bad input. Ctrl-C rolls
-    back (130). Killed, it leaves the canary running; the same command continues with the time that is left.
+    A share of the sessions gets the version, and the servers' metrics decide. It is rolled back at once if a limit is
+    exceeded with 99.7% confidence, if metrics fall or contradict themselves, or if they cannot be read for a minute;
+    and at the end if a limit is exceeded or there were too few cases. Exit code: 0 promoted, 1 rolled back, 4 stopped
+    because another command changed what is served or the server is unreachable, 2 bad input. Ctrl-C rolls back (130).
+    Killed, it leaves the canary running; the same command continues with the remaining time.
 
     Example: `rlservo policy promote ur5 2 --canary 10% --for 10m --max-error-rate 0.1% --max-p99 20ms`
     """

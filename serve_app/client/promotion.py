@@ -88,7 +88,7 @@ class Promotion:
         self._logged_at = -math.inf
 
     def run(self) -> Outcome:
-        """Watch and decide. Raises RlservoError if nothing has begun: bad input, or a server out of reach."""
+        """Watch and decide. Raises RlservoError if it cannot begin: bad input, or an unreachable server."""
         last, decided = self._log.last, None
         try:
             if last is None:
@@ -112,19 +112,19 @@ class Promotion:
             try:
                 self._write(END, outcome)
             except UsageError as error:
-                self._say(error.message)  # started again it finds nothing left to do
+                self._say(error.message)  # the same command, repeated, finds nothing left to do
             return outcome
         except (RlservoError, KeyboardInterrupt) as error:
             why = error.message if isinstance(error, RlservoError) else "interrupted meanwhile"
         return Outcome(
             STOPPED,
-            f"{decided.why}; but this could not be carried out ({why}): the same promotion, started again, continues; "
-            f"'rlservo policy canary {self._terms.policy} off' ends a canary that still runs",
+            f"{decided.why}; but this could not be carried out ({why}): the same command, given again, continues; "
+            f"'rlservo policy canary {self._terms.policy} off' ends a canary that is still running",
             is_finished=False,
         )
 
     def _patiently(self, step: Callable[[], Result]) -> Result:
-        """Return what a step returns; temporary faults have a minute to pass."""
+        """Return what a step returns, trying for a minute."""
         deadline = self._clock() + PATIENCE_S
         while True:
             try:
@@ -132,7 +132,7 @@ class Promotion:
             except RlservoError as error:
                 if self._clock() > deadline:
                     raise
-                self._say(f"tries again: {error.message}")
+                self._say(f"trying again: {error.message}")
             self._sleep(self._every_s)
 
     # Begin, or continue.
@@ -168,28 +168,28 @@ class Promotion:
         self._change(lambda client: client.canary(terms.policy, terms.version, terms.share))
         self._ends_at = self._clock() + terms.seconds
         self._say(
-            f"watches version {terms.version} of '{terms.policy}' against {self._production} for {terms.seconds:.0f} s,"
+            f"watching version {terms.version} of '{terms.policy}' against {self._production} for {terms.seconds:.0f} s"
             f" on {', '.join(self._counts.seen)}; the log is {self._log.path}"
         )
 
     def _resume(self, last: dict[str, Any]) -> Outcome | None:
-        """Take up what the log has; return what it has decided."""
+        """Restore the state from the log; return its decision, if it has one."""
         if last["terms"] != json.loads(json.dumps(asdict(self._terms))):
             raise UsageError(
-                f"{self._log.path} has a promotion that is not finished, with other terms ({last['terms']}): "
-                "start that one again, or name another --log"
+                f"{self._log.path} has an unfinished promotion with other terms ({last['terms']}): give that command "
+                "again, or name another --log"
             )
         try:
             self._production, self._generation = last["production"], int(last["generation"])
             self._counts = Counts(**last["counts"])
-            # A clock that was set back adds nothing, and one that was set while it ran changes nothing.
+            # A clock that was set back adds no time.
             gone_s = max(0.0, time.time() - datetime.fromisoformat(last["time"]).timestamp())
             self._ends_at = self._clock() + last["remaining_s"] - gone_s
             decided = Outcome(*last["decided"]) if last["decided"] else None
         except (KeyError, TypeError, ValueError) as error:
             raise UsageError(f"{self._log.path} cannot be read ({error!r}): name another --log") from None
         self._decided_at = self._generation if decided else None
-        self._say(f"continues: {max(0.0, self._remaining):.0f} s are left")
+        self._say(f"continuing: {max(0.0, self._remaining):.0f} s are left")
         return decided
 
     def _write(self, event: str, decided: Outcome | None = None, **fields: Any) -> None:
@@ -221,7 +221,7 @@ class Promotion:
                 return outcome
 
     def _look(self) -> str:
-        """Count on; return a sentence if another command has changed what is served."""
+        """Update the counts; return a sentence if another command has changed what is served."""
         if changed := self._changed(self._served()):
             return changed
         processes = self._processes()
@@ -275,7 +275,7 @@ class Promotion:
         if outcome == PROMOTED and (served is None or served.production != version):
             changed = self._changed(served)
             if not changed and self._decided_at not in (None, self._generation):
-                changed = f"this promotion may have been undone ({served and served.last_change}): start it again"
+                changed = f"someone may have undone this promotion ({served and served.last_change}): start it again"
             try:
                 if not changed:
                     self._change(lambda client: client.alias(name, PRODUCTION, version, expected=self._production))

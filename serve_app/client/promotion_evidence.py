@@ -1,12 +1,12 @@
-"""Evidence of a promotion: how the servers' counts of a policy have grown since it began, against its limits.
+"""Evidence of a promotion: the growth of the servers' counts of a policy since it began, against its limits.
 
-A process counts from its own start. Its increments between two checks are summed; one that disappears
-keeps what it had, and one that is new counts from its first look. Counters never fall: metrics that do are not trusted.
+A process counts from its own start, so its increments between two checks are summed. A process that disappears keeps
+its sum, and a new one counts from its first check. Counters never fall: metrics that do are not trusted.
 
-A limit is the share of requests, actions or episodes that may speak against a version: of failed requests, of requests
-slower than a p99 (1%), of actions further apart (1%), of episodes without success (production's share and the drop).
-While a version is watched it is rolled back when the share is surely too large: the lower bound of its 99.7% interval
-is, by three cases at least. In the end the share itself decides.
+A limit is the share of requests, actions or episodes that may count against a version: failed requests, requests slower
+than the p99 (1%), actions further apart (1%), episodes without success (production's share plus the drop). During the
+watch a version is rolled back if the lower bound of the share's 99.7% interval is above the limit, with at least three
+cases. At the end the share itself decides.
 
 Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22 (1927).
 """
@@ -34,7 +34,7 @@ Numbers = dict[str, float]  # by "name/label/..."
 
 
 class UntrustedError(Exception):
-    """The metrics contradict themselves or an earlier reading."""
+    """The metrics contradict themselves or an earlier check."""
 
 
 @dataclass
@@ -110,9 +110,9 @@ class Counts:
             self.seen[name] = now
 
 
-Z = 3.0  # standard deviations of every interval, 99.7%: it is looked at often, and each look may err
+Z = 3.0  # standard deviations of every interval, 99.7%: there are many checks, and each may err
 FEWEST = 3  # cases against a version before anything stops early
-TAIL = 0.01  # of the requests and actions, what a p99 leaves out
+TAIL = 0.01  # share of the requests and actions beyond a p99
 CLIENTS_OWN = frozenset(  # failures that are not the version's fault
     {
         *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
@@ -168,7 +168,7 @@ def figures(limits: Limits, total: Numbers, production: str, candidate: str) -> 
     """Yield a figure for every limit."""
 
     def of_requests(what: str, against: float, cases: float, allowed: float) -> Figure:
-        # With fewer a version at its limit has no case against it, more often than not.
+        # With fewer, a version at its limit would more likely than not have no case against it.
         needed = max(limits.min_requests, math.ceil(1 / allowed) if allowed else 0)
         return Figure(what, against, cases, allowed, "" if cases >= needed else f"{needed:,} needed")
 

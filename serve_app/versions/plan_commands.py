@@ -62,14 +62,14 @@ class Command(BaseModel):
 
 
 class Load(Command):
-    """Add a version, or take its bundle as it is now; what clients get stays as it is.
+    """Add a version, or replace its bundle by the current one; clients keep the version that they get.
 
     The first version of a policy that is not served becomes its `production`: it changes no reply but a 404.
     """
 
     verb = "load"
-    summary = "Load a version, prove it, and keep it ready: not in use until an alias leads to it"
-    version: Version | None = Field(default=None, description="The repository's newest when left out.")
+    summary = "Load a version, prove it, and keep it ready: not in use until an alias points to it"
+    version: Version | None = Field(default=None, description="The repository's newest by default.")
     _digest: str = PrivateAttr("")
 
     @property
@@ -91,7 +91,7 @@ class Load(Command):
         uses = _uses(policy, version)
         if uses and policy.versions[version] != self._digest:
             raise ConflictError(
-                f"policy '{name}' version {version} is in use by {uses}, and its folder holds another bundle by now: "
+                f"policy '{name}' version {version} is in use by {uses}, but its folder now holds another bundle: "
                 "export changes under a new version, or point that elsewhere first"
             )
         return _changed(name, policy, versions={**policy.versions, version: self._digest})
@@ -99,8 +99,8 @@ class Load(Command):
 
 class Unload(Command):
     verb = "unload"
-    summary = "Drop a version, or the policy"
-    version: Version | None = Field(default=None, description="The whole policy when left out.")
+    summary = "Unload a version, or the policy"
+    version: Version | None = Field(default=None, description="The whole policy by default.")
 
     @property
     def words(self) -> str:
@@ -119,16 +119,18 @@ class Unload(Command):
 
 
 class SetAlias(Command):
-    """Let an alias lead to a loaded version, or remove it; `production` can only be moved.
+    """Point an alias to a loaded version, or remove it; `production` can only be moved.
 
-    `expected` protects another operator's move from being undone unseen. The same command twice is no contradiction.
+    `expected` protects another operator's change. The same command twice succeeds twice.
     """
 
     verb = "alias"
-    summary = "Let an alias lead to a loaded version"
+    summary = "Point an alias to a loaded version"
     alias: Alias = Field(description="`production` is the default version; it can be moved, not removed.")
     version: Version | None = Field(description="A loaded version; null removes the alias.")
-    expected: Version | None = Field(None, description="Where the alias leads now; when it does not, nothing changes.")
+    expected: Version | None = Field(
+        None, description="Version that the alias points to now; if it points elsewhere, nothing changes."
+    )
 
     @property
     def words(self) -> str:
@@ -145,7 +147,7 @@ class SetAlias(Command):
             raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(policy.aliases)}")
         if alias == PRODUCTION:
             raise ConflictError(
-                f"the alias '{PRODUCTION}' of policy '{name}' says what clients get that ask for no version: point it "
+                f"the alias '{PRODUCTION}' of policy '{name}' names the version for clients that name none: point it "
                 "elsewhere, or unload the policy"
             )
         for use, reference in policy.uses.items():
@@ -155,13 +157,15 @@ class SetAlias(Command):
 
 
 class Rollback(Command):
-    """Let an alias lead where it led before, to the same bundle, which is loaded again if need be."""
+    """Point an alias back to its previous version, the same bundle, which is loaded again if necessary."""
 
     verb = "rollback"
-    summary = "Let an alias lead where it led before"
-    alias: Alias = Field(PRODUCTION, description="The alias; `production` when left out.")
+    summary = "Point an alias back to its previous version"
+    alias: Alias = Field(PRODUCTION, description="The alias; `production` by default.")
     expected: Version | None = Field(
-        None, description="Where the alias leads now; when it does not, nothing changes. Makes a repeated command safe."
+        None,
+        description="Version that the alias points to now; if it points elsewhere, nothing changes. Makes a repeated "
+        "command safe.",
     )
 
     @property
@@ -181,7 +185,7 @@ class Rollback(Command):
 
 class SetCanary(Command):
     verb = "canary"
-    summary = "Send a share of the sessions to another version"
+    summary = "Give another version a share of the sessions"
     version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
     share: float | None = Field(None, ge=0, le=1, description="Of the sessions; 0 ends the canary.")
 
@@ -198,7 +202,7 @@ class SetCanary(Command):
 
 class SetShadow(Command):
     verb = "shadow"
-    summary = "Let another version compute along"
+    summary = "Compute and compare another version's actions, without using them"
     version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
 
     @property
@@ -241,7 +245,7 @@ def parse(command: str, document: dict[str, Any]) -> Command:
 
 
 def first_policies(config: ServedConfig, available: Mapping[str, Mapping[str, str]]) -> Policies:
-    """Return the policies that a configuration means, given the repository's bundles (name -> version -> hash).
+    """Return the policies of a configuration, given the repository's bundles (name -> version -> hash).
 
     Raises UnknownPolicyError, UnknownVersionError, ConflictError.
     """
@@ -291,7 +295,7 @@ def differences(before: Mapping[str, PolicyPlan], after: Mapping[str, PolicyPlan
 
 
 def _changed(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
-    """Return a policy with these changes: versions sorted, everything leads to a loaded one, the way back is kept."""
+    """Return a policy with these changes: versions sorted, no use without a loaded version, the way back kept."""
     values: dict[str, Any] = {field: getattr(was, field) for field in PolicyPlan.model_fields} | changes
     versions = _sorted(values["versions"])
     aliases: dict[str, str] = dict(values["aliases"])
@@ -315,24 +319,24 @@ def _moved(policy: PolicyPlan, aliases: Mapping[str, str]) -> dict[str, tuple[st
     for alias, version in policy.aliases.items():
         if aliases.get(alias) != version:
             history[alias] = (*history.get(alias, ()), version)[-LONGEST_HISTORY:]
-    for alias, version in aliases.items():  # loaded again as what it was: the way back is further back
+    for alias, version in aliases.items():  # the same version again is not its own way back
         if history.get(alias, ())[-1:] == (version,):
             history[alias] = history[alias][:-1]
     return history
 
 
 def _uses(policy: PolicyPlan, version: str) -> str:
-    """Return everything that leads to a version, in words."""
+    """Return everything that points to a version, in words."""
     return " and ".join(use for use, reference in policy.uses.items() if policy.version_of(reference) == version)
 
 
 def _expect(policy: PolicyPlan, name: str, alias: str, expected: str | None) -> None:
-    """Raise ConflictError if an alias does not lead where the caller believes; None believes nothing."""
-    leads = policy.aliases.get(alias)
-    if expected not in (None, leads):
-        now = f"leads to {leads}" if leads is not None else "is gone"
+    """Raise ConflictError unless an alias points to the version that the caller expects, if any."""
+    version = policy.aliases.get(alias)
+    if expected not in (None, version):
+        now = f"points to {version}" if version is not None else "is gone"
         raise ConflictError(
-            f"the alias '{alias}' of policy '{name}' {now} and was expected at {expected}: moved already"
+            f"the alias '{alias}' of policy '{name}' {now}, but was expected to point to {expected}: someone moved it"
         )
 
 

@@ -110,10 +110,10 @@ class PlanWriter:
             if any(key in theirs and theirs[key] != value for key, value in ours.items()):
                 raise ConflictError(
                     f"another command came first (plan {first.generation}: {first.changed_by}), and this one has "
-                    "changed nothing: look at `rlservo policy list`, and give it again if it still holds"
+                    "changed nothing: look at `rlservo policy list`, and repeat it if it still applies"
                 )
             before = first
-        raise UnavailableError("others keep changing what is served: try again")
+        raise UnavailableError("other commands keep changing the plan: try again")
 
     async def _unwritten(self, config: ServedConfig) -> Plan:
         """Return the plan before the first, which is not written."""

@@ -1,6 +1,6 @@
-"""Policies that a server holds: names, versions, aliases, and the one call of every protocol, `act`.
+"""Loaded policies of a server by name, version and alias, and the one call of every protocol, `act`.
 
-A store does not change: a change is another store, and a request ends with the one it began with.
+A store never changes: a new plan makes a new store, and a request finishes with the store it began with.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class EpisodeNote:
 
 @dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
 class Decision:
-    """An action, and who decided it how fast."""
+    """An action, and the policy, version and time that it took."""
 
     action: Any
     """An array, or dicts and tuples of arrays where the action space is nested."""
@@ -59,7 +59,7 @@ class Decision:
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """A version that computes along with the default one."""
+    """A version whose actions are computed and compared with the default version's, and not used."""
 
     of: str  # the default version
     version: str
@@ -68,7 +68,7 @@ class Shadow:
 
 @dataclass(frozen=True, slots=True)
 class _Served:
-    """One policy's loaded versions, and which of them are for what."""
+    """One policy's loaded versions, and their uses."""
 
     plan: PolicyPlan
     versions: Mapping[str, Policy]  # oldest first
@@ -88,10 +88,10 @@ class PolicyStore:
         *,
         changed: Iterable[str] = (),
     ) -> None:
-        """Take loaded policies, and by name the plan that each is served by; those `changed` were served otherwise.
+        """Take loaded policies, and the plan of each by name; `changed` names those that had other versions before.
 
-        A plan may name versions that are not among the policies; an alias, canary or shadow that leads to one is left
-        out. Raises UsageError when the default version is not there: no other takes its place.
+        A plan may name versions that are not among the policies; aliases, canary and shadow that point to one are left
+        out. Raises UsageError if the default version is missing: no other takes its place.
         """
         self.plans = plans
         self._changed = frozenset(changed)
@@ -133,13 +133,13 @@ class PolicyStore:
         return policy
 
     def find(self, name: str, identity: str) -> Policy | None:
-        """Return the policy of a name that a recurrent state is of (`Policy.identity`), if it is loaded."""
+        """Return the policy that a recurrent state belongs to (by `Policy.identity`), if it is loaded."""
         served = self._served.get(name)
         versions = () if served is None else served.versions.values()
         return next((each for each in versions if each.identity == identity), None)
 
     def has(self, policy: Policy) -> bool:
-        """Whether this very policy is loaded, and not another one under its name and version."""
+        """Whether this policy itself is loaded, and not another one of its name and version."""
         served = self._served.get(policy.contract.name)
         return served is not None and served.versions.get(policy.contract.version) is policy
 
@@ -148,10 +148,9 @@ class PolicyStore:
         return any(policy.is_stateful for policy in self._find(name).versions.values())
 
     def is_certain(self, name: str, version: str | None) -> bool:
-        """Whether a recurrent state that does not say whose it is can only be of the policy that this request gets.
+        """Whether a recurrent state without an identity can only belong to the policy that this request gets.
 
-        So it is where the version itself is named (an alias may lead elsewhere by now), and if there is and was
-        only one.
+        True if the request names the version itself (an alias may have moved), and if there is and was only one.
         """
         versions = self._find(name).versions
         return version in versions or (len(versions) == 1 and name not in self._changed)
@@ -164,10 +163,10 @@ class PolicyStore:
             return ""
 
     def choose(self, name: str, version: str | None, label: str | None) -> Policy:
-        """Return the policy that a request gets: as `get`, but when a canary runs, a share of the labels get that.
+        """Return the policy for a request: as `get`, but a canary gets its share of the labels.
 
-        All requests of a label get the same one, on every replica, for as long as the share does not change; a larger
-        share keeps those it had. Raises what `get` raises.
+        All requests of a label get the same policy, on every replica, while the share does not change; a larger share
+        keeps the labels it had. Raises what `get` raises.
         """
         if version is None:
             served = self._find(name)
@@ -177,12 +176,12 @@ class PolicyStore:
         return self.get(name, version)
 
     def is_drawn(self, name: str, label: str | None) -> bool:
-        """Whether chance says, request by request, which version a request without a version gets."""
+        """Whether each request without a version draws it at random."""
         served = self._served.get(name)
         return label is None and served is not None and served.canary is not None
 
     def shadow(self, name: str) -> Shadow | None:
-        """Return the version that computes along, if there is one."""
+        """Return the policy's shadow, if it has one."""
         return self._find(name).shadow
 
     def act(
@@ -255,12 +254,12 @@ def take_step(policy: Policy, obs: Observation, **given: Any) -> tuple[Decision,
 
 
 def blame(error: Exception, version: str) -> None:
-    """Write the version that was asked on its error: with a canary, no one else knows which one it was."""
+    """Attach the version that failed to its error: with a canary, callers cannot know it."""
     error.policy_version = version  # type: ignore[attr-defined]
 
 
 def blamed_version(error: Exception) -> str | None:
-    """Return the version that was asked and failed with this error; None where none was asked."""
+    """Return the version that failed with this error; None if none was called."""
     return getattr(error, "policy_version", None)
 
 

@@ -1,8 +1,8 @@
 """Shadow versions: a candidate computes after the reply, and only its difference is kept.
 
-Nothing waits for it: what comes while too much is waiting is left out and counted. Exploring actions are not compared,
-since they differ by chance. The difference is the largest of |candidate - default| over an action's elements, in the
-action's own units; for discrete actions it is 0 or the distance of their numbers.
+No request waits for it: requests beyond a full queue are skipped and counted. Exploring actions are not compared, since
+they differ by chance. The difference is the largest of |candidate - default| over an action's elements, in the action's
+own units; for discrete actions it is 0 or the distance of their numbers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rlservo.serve_app.versions.policy_store import Decision, Shadow
 
 logger = logging.getLogger(__name__)
 
-WAITING = 64  # requests at most, so that a slow candidate costs neither memory nor the default version's time
+WAITING = 64  # requests at most, so that a slow candidate takes neither memory nor the default version's time
 
 Record = Callable[[str, str, str, Iterable[float]], None]
 """Takes the differences between the actions of a policy's version and its shadow: (policy, version, shadow, ...)."""
@@ -48,9 +48,9 @@ class Shadows:
         self._series: dict[tuple[str, str, str], _Series] = {}
 
     def offer(self, shadow: Shadow, obs: Any, decision: Decision) -> None:
-        """Have the candidate compute on `obs` some time later. Never waits.
+        """Queue `obs` for the candidate. Never waits.
 
-        One that remembers its episode is left out: it would need a recurrent state of its own for every caller.
+        A stateful candidate is skipped: it would need a recurrent state of its own for every caller.
         """
         if shadow.policy.is_stateful:
             self._series_of(shadow, decision).left_out += 1
@@ -87,10 +87,10 @@ class Shadows:
             series = self._series_of(shadow, decision)
             try:
                 differences = _differences(shadow.policy.act(obs), decision.action, batch=decision.batch)
-            except RlservoError:  # its action left the space, say: that is what a shadow is run for
+            except RlservoError:  # for example its action left the space: a shadow is run to find that
                 series.failed += 1
                 continue
-            except Exception:  # this thread serves every shadow, and has to outlive one that is broken
+            except Exception:  # this thread serves every shadow and must survive a broken one
                 logger.exception("shadow %s of policy '%s' failed", shadow.version, decision.name)
                 series.failed += 1
                 continue

@@ -165,12 +165,12 @@ class VersionLoader:
             if _interface(theirs) != _interface(ours):
                 raise RefusedError(
                     f"policy '{name}' version {version} cannot be the {role} of version {policy.default}: its "
-                    "observations or actions are of other names, types or shapes"
+                    "observations or actions have other names, types or shapes"
                 )
             if role == "canary" and theirs.state != ours.state:
                 raise RefusedError(
-                    f"policy '{name}' version {version} cannot be the canary of version {policy.default}: what it "
-                    "remembers of an episode is something else"
+                    f"policy '{name}' version {version} cannot be the canary of version {policy.default}: its "
+                    "recurrent state has other names, types or shapes"
                 )
             if role == "shadow" and theirs.state:
                 raise RefusedError(

@@ -455,7 +455,7 @@ def test_an_alias_that_is_moved_in_the_last_moment_is_not_moved_back(
 
     monkeypatch.setattr(AdminClient, "alias", race)
     outcome = run()(lambda: server.ask(200))
-    assert outcome.outcome == STOPPED and "leads to 4 and was expected at 1" in outcome.why, outcome
+    assert outcome.outcome == STOPPED and "points to 4, but was expected to point to 1" in outcome.why, outcome
     assert server.state == ("4", None, None)
 
 
@@ -624,7 +624,7 @@ def test_killed_half_way_it_goes_on_with_what_was_counted(run: Any, server: Serv
 
     outcome = again(end_of_time)
     assert outcome.outcome == PROMOTED, outcome
-    assert any("continues" in line for line in again.said)
+    assert any("continuing" in line for line in again.said)
     assert again.answered("1") + again.answered("2") == 200
     assert server.state == ("2", None, None)
 
@@ -708,7 +708,11 @@ def test_a_promotion_that_was_undone_is_not_done_again(run: Any, server: Server)
     with server.admin() as admin:
         admin.rollback("ur5", "production")
     outcome = promotion()
-    assert outcome.outcome == STOPPED and outcome.is_finished and "may have been undone (the last change" in outcome.why
+    assert (
+        outcome.outcome == STOPPED
+        and outcome.is_finished
+        and "may have undone this promotion (the last change" in outcome.why
+    )
     assert server.state == ("1", None, None)
 
 
@@ -716,7 +720,7 @@ def test_other_terms_do_not_go_on_with_it_and_a_second_process_waits_for_the_fir
     promotion = run()
     with pytest.raises(SystemExit):
         promotion(kill)
-    with pytest.raises(UsageError, match="is not finished, with other terms"):
+    with pytest.raises(UsageError, match="has an unfinished promotion with other terms"):
         run(share=0.4)()
     whole = promotion.log.read_text()
     promotion.log.write_text(whole.replace('"seen"', '"saw"'))
@@ -788,5 +792,5 @@ def test_a_clock_that_was_set_meanwhile_adds_no_time(
     monkeypatch.setattr("rlservo.serve_app.client.promotion.time.time", lambda: now() + jump_s)
     steps = [lambda: server.ask(60 if jump_s < 0 else 0), *[lambda: None] * 9]
     outcome = promotion(*steps, lambda: pytest.fail("it goes on indefinitely"))
-    assert any(f"continues: {left}" in line for line in promotion.said), promotion.said
+    assert any(f"continuing: {left}" in line for line in promotion.said), promotion.said
     assert outcome.outcome == (PROMOTED if jump_s < 0 else ROLLED_BACK) and server.plan.canary is None
