@@ -116,7 +116,8 @@ def _with(index: Index | None, bundle: Bundle, place: object) -> bytes:
 
 def _published(index: Index | None, bundle: Bundle) -> str | None:
     """Return the hash under which a bundle's version is published."""
-    return index and index.policies.get(bundle.contract.name, {}).get(bundle.contract.version)
+    policies = {} if index is None else index.policies
+    return policies.get(bundle.contract.name, {}).get(bundle.contract.version)
 
 
 def _publish_to_folder(bundle: Bundle, root: Path) -> None:
