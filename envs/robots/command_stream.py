@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from rlservo.envs.robots.arm import ROS2, STOP_NAMES, RobotError
 from rlservo.envs.robots.limits import COUNTED, LATE, Limits, MotionLimiter
+from rlservo.envs.robots.link_delay import LinkDelay
 from rlservo.envs.robots.shared_block import SharedBlock
 from rlservo.envs.ur.simulation import URSimulation
 
@@ -35,7 +36,6 @@ STARTUP_MODES = (
 )  # fmt: skip
 LOST_S = 1.0  # [s] without a package, after which the connection counts as lost
 SLOW_CALL_S = 0.3  # [s] for one command; ur_rtde has lost the script or reconnected meanwhile
-OFFSET_CREEP = 0.001  # [s/s], of two clocks that drift; a link's delay that grows faster is one
 AGE_BOUND_S = 0.1  # [s] of a state that may be acted on
 AT_REST = 1e-3  # [rad/s]
 CLOSE_S = 4.0  # [s], for closing the connections
@@ -206,7 +206,7 @@ class CommandStream:
         self._counts = np.zeros(len(COUNTED))
         self._phase, self._blend = Phase.HOLD, 0.0
         self._robot_s, self._received_s, self._age_s = 0.0, time.monotonic(), 0.0
-        self._usual_offset_s = float("inf")
+        self._delay = LinkDelay()
         self.is_asked_to_end = threading.Event()
 
     def run(self, on_ready: Callable[[], None]) -> None:
@@ -237,12 +237,9 @@ class CommandStream:
         """Read the newest state and judge its age: by what the link's delay exceeds the usual one."""
         robot_s = self._robot.receive.getTimestamp()
         if robot_s != self._robot_s:
-            offset = now - robot_s
-            creep = OFFSET_CREEP * (now - self._received_s)
-            self._usual_offset_s = min(offset, self._usual_offset_s + creep)
-            known_s = self._robot.age_s()
+            excess_s, known_s = self._delay.excess_s(robot_s, now), self._robot.age_s()
             self._robot_s, self._received_s = robot_s, now
-            self._age_s = offset - self._usual_offset_s if known_s is None else known_s
+            self._age_s = excess_s if known_s is None else known_s
 
     def _check(self) -> None:
         receive, now = self._robot.receive, time.monotonic()

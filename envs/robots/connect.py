@@ -23,7 +23,7 @@ def make_arm(
     if host is None:
         return URSimulation(ur_model, **scene)
     from rlservo.envs.robots.limits import Limits
-    from rlservo.envs.robots.mirror import MirroredSimulation
+    from rlservo.envs.robots.mirrored_arm import MirroredArm
     from rlservo.envs.robots.operator_terminal import Operator
     from rlservo.envs.robots.rtde_arm import RtdeArm
 
@@ -39,4 +39,4 @@ def make_arm(
         )
 
     operator = Operator(is_asked=confirm)
-    return MirroredSimulation(ur_model, connect=connect, operator=operator, metrics=metrics, **scene)
+    return MirroredArm(ur_model, connect=connect, operator=operator, metrics=metrics, **scene)

@@ -98,7 +98,7 @@ def _first_motion(arm: RtdeArm, goal: Vector, began: float, periods_s: list[floa
             before = state
         if abs(state.velocities[JOINT]) > NOTICED:
             return state.received_s
-        if fault := arm.fault():
+        if fault := arm.fault:
             raise RobotError(f"the robot stopped: {fault}")
         if time.monotonic() - given > AGAIN_S:  # a setpoint lasts for half a second
             given = time.monotonic()

@@ -8,11 +8,13 @@ the old velocity and the new: both keep those limits, and so does every mixture.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Self
 
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
@@ -32,8 +34,29 @@ WALL_MARGIN = 0.03  # [m], by which walls stand further in: for the curvature th
 SHARE = 0.5  # of a tool axis' braking ability that a wall counts on: joints have other limits to keep meanwhile
 
 
+class CheckedLimits:
+    """Base of limits, frozen dataclasses: numbers are checked against `RANGES`, names against the fields."""
+
+    RANGES: ClassVar[dict[str, tuple[float, float]]]
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in self.RANGES.items():
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float)) and low <= value <= high):
+                raise RobotError(f"limits: {name} is {value!r}: expected a number from {low:g} to {high:g}")
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """Return the limits with some values replaced. Raises RobotError for names that do not exist."""
+        names = [one.name for one in fields(cls)]  # type: ignore[arg-type]  # its subclasses are dataclasses
+        unknown = [name for name in values if name not in names]
+        if unknown:
+            raise RobotError(f"limits: {', '.join(unknown)} does not exist: expected some of {', '.join(names)}")
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})
+
+
 @dataclass(frozen=True)
-class Limits:
+class Limits(CheckedLimits):
     """Limits of the command stream; the controller's own safety limits stand behind them."""
 
     speed_scale: float = 1.0  # of all velocities below; a first run takes 0.1
@@ -50,29 +73,18 @@ class Limits:
     gain: float = 300.0  # servoj's
     rate_hz: float = 0.0  # of the command stream; 0: the robot's own, 125 or 500 Hz
 
+    RANGES: ClassVar[dict[str, tuple[float, float]]] = {
+        "speed_scale": (0.001, 1.0), "acceleration": (0.1, 15.0), "tool_speed": (0.01, 3.0),
+        "start_speed": (0.01, 1.0), "blend_s": (0.0, 60.0), "watchdog_hz": (1.0, 100.0),
+        "lookahead_s": (0.03, 0.2), "gain": (100.0, 2000.0), "rate_hz": (0.0, 500.0),
+    }  # fmt: skip
+
     def __post_init__(self) -> None:
-        ranges = {
-            "speed_scale": (0.001, 1.0), "acceleration": (0.1, 15.0), "tool_speed": (0.01, 3.0),
-            "start_speed": (0.01, 1.0), "blend_s": (0.0, 60.0), "watchdog_hz": (1.0, 100.0),
-            "lookahead_s": (0.03, 0.2), "gain": (100.0, 2000.0), "rate_hz": (0.0, 500.0),
-        }  # fmt: skip
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and low <= value <= high):
-                raise RobotError(f"limits: {name} is {value!r}: expected a number from {low:g} to {high:g}")
+        super().__post_init__()
         for name, size in (("box", 3), ("position", 6)):
             low_values, high_values = getattr(self, f"{name}_low"), getattr(self, f"{name}_high")
             if not len(low_values) == len(high_values) == size or not np.all(np.less(low_values, high_values)):
                 raise RobotError(f"limits: {name}_low and {name}_high: expected {size} numbers each, low below high")
-
-    @classmethod
-    def of(cls, values: dict[str, object]) -> Limits:
-        """Return the limits with some values replaced. Raises RobotError for names that do not exist."""
-        names = [one.name for one in fields(cls)]
-        unknown = [name for name in values if name not in names]
-        if unknown:
-            raise RobotError(f"limits: {', '.join(unknown)} does not exist: expected some of {', '.join(names)}")
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in values.items()})  # type: ignore[arg-type]  # checked above
 
 
 def braking_speed(distance: Vector | float, deceleration: Vector | float, dt: float) -> Vector:

@@ -1,160 +1,99 @@
-"""A real arm in the place of the simulated one: the environments see it through the scene's model.
+"""A real robot in the place of a simulated one: what the mirrors of an arm and of a base share.
 
-The model stands where the arm was measured, so that tool, contacts and pictures are computed as in the simulator;
-commands go to the arm, and a control cycle passes in real time. The state machine around the policy is here.
+The model stands where the robot was measured, and a control cycle passes in real time. The state machine around the
+policy is here: faults and connecting again, a person who takes over, late and stale commands.
 """
 
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Generic, Protocol, TypeVar
 
-import mujoco
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from rlservo.envs.checks import InvalidResetError
-from rlservo.envs.robots.arm import ArmState, RobotError
-from rlservo.envs.robots.command_stream import AGE_BOUND_S, Phase
+from rlservo.envs.robots.command_stream import Phase
 from rlservo.envs.robots.operator_terminal import Operator
-from rlservo.envs.robots.rtde_arm import RtdeArm
 from rlservo.envs.robots.states import State, StateMachine
-from rlservo.envs.ur.simulation import URSimulation
 
-if TYPE_CHECKING:
-    from rlservo.envs.robots.metrics import ArmMetrics
-
-AT_START = 0.03  # [rad], from which on the arm need not move
-PATH_STEP = 0.05  # [rad], between two poses of a way that are looked at
-SETTLE_S = 0.2
 FRESH_S = 6.0  # [s], for which a state that may be acted on is waited for; ur_rtde itself waits for 3 s
 STALE_CYCLES = 2.0  # between an observation and the action for it
-LATE_CYCLES = 2.5  # between two setpoints
+LATE_CYCLES = 2.5  # between two commands
+LOOK_S = 0.002
 
-Vector = NDArray[np.float64]
 _PHASE_STATES = {Phase.LATE: (State.HOLD, "no setpoint came"), Phase.STALE: (State.HOLD, "the robot's state is old")}
 
 
-class MirroredSimulation(URSimulation):
-    """The scene of an arm that is a real one. What `connect` returns is closed by `close`."""
+class Measured(Protocol):
+    """A robot's state: when it arrived, by time.monotonic(), and how old it was then [s]."""
+
+    @property
+    def received_s(self) -> float: ...
+    @property
+    def age_s(self) -> float: ...
+
+
+class Robot(Protocol):
+    """A robot that carries out one command after the other; `fault` is empty while it takes them."""
+
+    @property
+    def phase(self) -> Phase: ...
+    @property
+    def blend(self) -> float: ...
+    @property
+    def fault(self) -> str: ...
+    def hold(self) -> None: ...
+    def free(self) -> None: ...
+    def blend_in(self) -> None: ...
+    def limited(self) -> dict[str, int]: ...
+    def close(self) -> None: ...
+
+
+RobotT = TypeVar("RobotT", bound=Robot)
+MeasuredT = TypeVar("MeasuredT", bound=Measured)
+
+
+class Mirror(ABC, Generic[RobotT, MeasuredT]):
+    """The robot's side of a mirror; the other base class is the simulation that it replaces."""
+
+    stopped_by: str | None
 
     def __init__(
-        self,
-        ur_model: str,
-        *,
-        connect: Callable[[float], RtdeArm],
-        operator: Operator,
-        max_velocity_scale: float,
-        cycle_s: float,
-        metrics: str | None = None,
-        **scene: Any,
+        self, connect: Callable[[float], RobotT], operator: Operator, *, cycle_s: float, age_bound_s: float
     ) -> None:
-        """`connect` takes the time [s] after which the arm holds without a setpoint. Raises what it raises.
-
-        `metrics` is the address, HOST:PORT, at which Prometheus reads the arm's.
-        """
-        super().__init__(ur_model, max_velocity_scale=max_velocity_scale, cycle_s=cycle_s, **scene)
-        self.operator = operator
-        self.states = StateMachine()
+        """`connect` takes the time [s] after which the robot holds without a command. Raises what it raises."""
+        self.operator, self.states = operator, StateMachine()
         self.stale_actions = 0
-        self._cycle_s = cycle_s
-        self._connect = connect
+        self._connect, self._cycle_s, self._age_bound_s = connect, cycle_s, age_bound_s
         self._due_s = 0.0
         self._counts: dict[str, int] = {}
         self._lost: dict[str, int] = {}  # counts of connections that are closed
-        self._arm = self._connected()
-        self.state_seen = self._arm.arm_state()
-        self._metrics: ArmMetrics | None = None
-        if metrics is not None:
-            from rlservo.envs.robots.metrics import ArmMetrics
+        self._robot = self._connected()
+        self.state_seen = self._newest()
 
-            try:
-                self._metrics = ArmMetrics(
-                    metrics, self._arm.host, counts=self.limited, state=lambda: self.states.state
-                )
-            except RobotError:
-                self._arm.close()
-                raise
-        self._mirror()
+    # -- what a mirror adds
+
+    @abstractmethod
+    def _newest(self) -> MeasuredT:
+        """Return the robot's newest state."""
+
+    @abstractmethod
+    def _show(self, state: MeasuredT) -> None:
+        """Put the model where the robot is."""
 
     # -- instead of the simulation's
 
-    def place(self, joint_positions: ArrayLike) -> bool:
-        """Move the arm slowly to joint positions [rad] (6,), after asking; return whether it would collide there.
-
-        Raises InvalidResetError where something is in the way, RobotError for a robot that has stopped.
-        """
-        goal = np.asarray(joint_positions, dtype=np.float64)
-        if super().place(goal):
-            return True
-        self._recover()
-        start = self._arm.arm_state().positions
-        away = float(np.abs(goal - start).max())
-        for share in np.linspace(0.0, 1.0, 2 + int(away / PATH_STEP)):
-            if super().place(start + share * (goal - start)) and share > 0.0:
-                links = " and ".join(self.contacts()[0])
-                raise InvalidResetError(f"on the straight way to the start {links} would touch: move the arm by hand")
-        if away > AT_START:
-            speed = self._arm.limits.start_speed * self._arm.limits.speed_scale
-            self.operator.confirm(f"the robot moves to its start, {away:.2f} rad at {speed:.2g} rad/s")
-            self.states.enter(State.GO_TO_START, f"{away:.2f} rad away")
-            try:
-                self._arm.go_to(goal)
-            except RobotError as error:
-                self.states.enter(State.FAULT, str(error))
-                raise
-            self.states.enter(State.READY)
-        elif self.states.state not in (State.READY, State.HUMAN):
-            self._arm.hold()
-            self.states.enter(State.READY)
-        self.in_collision, self.stopped_by = False, None
-        self._mirror()
-        self.states.enter(State.BLEND_IN)
-        self._arm.blend_in()
-        self.operator.watch_keys()
-        self._due_s = time.monotonic()
-        return self.in_collision
-
-    def settle(self) -> None:
-        """Wait until the arm stands."""
-        self._arm.hold()
-        time.sleep(SETTLE_S)
-        self._mirror()
-
-    def command(self, joint_positions: ArrayLike) -> None:
-        """Replace the setpoint, unless a person leads the arm or what was observed is too old to act on."""
-        self.data.act[:] = self._arm.setpoint()
-        super().command(joint_positions)
-        age_s = time.monotonic() - self.state_seen.received_s + self.state_seen.age_s
-        if self.states.state == State.HUMAN:
-            self._velocity[:] = 0.0
-        elif age_s > STALE_CYCLES * self._cycle_s + AGE_BOUND_S:
-            self.stale_actions += 1
-            self._velocity[:] = 0.0
-            self._arm.hold()
-            self.states.enter(State.HOLD, f"the action is for an observation {age_s:.2f} s old")
-        else:
-            self._arm.command(joint_positions, self._remaining * self.model.opt.timestep)
-
     def hold(self) -> None:
-        """Stop where the arm is."""
-        self._velocity[:] = 0.0
-        self._arm.hold()
+        """Decelerate and stand, unless a person leads the robot."""
+        if self.states.state != State.HUMAN:
+            self._robot.hold()
 
-    def advance(self) -> None:
-        """Wait for the end of the control cycle and look at the arm."""
+    def advance(self, substeps: int = 0) -> None:  # noqa: ARG002  # a simulated base's
+        """Wait for the end of the control cycle and look at the robot."""
         now = time.monotonic()
-        self._due_s = max(self._due_s + self._cycle_s, now - self._cycle_s)
-        if now - self._due_s > 0.0:
-            self._due_s = now  # a cycle that was missed is not caught up
-        time.sleep(max(0.0, self._due_s - now))
-        self._mirror()
+        self._due_s = max(self._due_s + self._cycle_s, now)  # a cycle that was missed is not caught up
+        time.sleep(self._due_s - now)
+        self._look()
         self._follow_states()
-
-    def arm_state(self) -> ArmState:
-        """Return the newest state of the arm."""
-        return self._arm.arm_state()
 
     def robot_info(self) -> dict[str, Any] | None:
         """Return the state, its changes and the limits that were kept, since the last call."""
@@ -169,84 +108,103 @@ class MirroredSimulation(URSimulation):
         return info
 
     def take_over(self) -> None:
-        """Let a person lead the arm from the next control cycle on, or give it back."""
+        """Leave the robot to a person from the next control cycle on, or take it back."""
         self.operator.toggle()
 
     def limited(self) -> dict[str, int]:
-        """Return how many cycles of the command stream each limit was kept in, by element, and stale actions."""
+        """Return how many commands each limit was kept in, by element, and stale actions."""
         counts = dict(self._lost)
-        for name, count in self._arm.limited().items():
+        for name, count in self._robot.limited().items():
             counts[name] = counts.get(name, 0) + count
         return counts | ({"stale_action": self.stale_actions} if self.stale_actions else {})
 
     def close(self) -> None:
-        """Stop the arm and close the connection."""
+        """Stop the robot and close the connection."""
         self.states.enter(State.STOP, "the environment is closed")
         self.operator.close()
-        self._arm.close()
-        if self._metrics is not None:
-            self._metrics.close()
+        self._robot.close()
 
-    # -- parts
-
-    def _connected(self) -> RtdeArm:
-        self.states.enter(State.CONNECT)
-        arm = self._connect(LATE_CYCLES * self._cycle_s)
-        self.states.enter(State.CHECK)
-        self.states.enter(State.READY, arm.host)
-        return arm
+    # -- for mirrors
 
     def _recover(self) -> None:
         """Connect again after a fault. Raises RobotError while the robot is not ready."""
-        if self.states.state != State.FAULT and not self._arm.fault():
+        if not self._note_fault() and self.states.state != State.FAULT:
             return
-        self._note_fault()
-        self._lost = self._arm.limited()
-        self._arm.close()
-        self._arm = self._connected()
+        self._lost = self.limited()
+        self._robot.close()
+        self._robot = self._connected()
 
-    def _mirror(self) -> None:
-        """Put the model where the arm is; wait, standing, for a state that may be acted on."""
+    def _begin(self) -> None:
+        """Begin an episode, standing: the first command starts to blend in."""
+        if self.states.state not in (State.HUMAN, State.FAULT):
+            self.states.enter(State.BLEND_IN)
+            self._robot.blend_in()
+        self.operator.watch_keys()
+        self._due_s = time.monotonic()
+
+    def _may_act(self) -> bool:
+        """Return whether a command may go to the robot; hold where what was observed is too old to act on."""
+        if self.states.state in (State.HUMAN, State.FAULT):
+            return False
+        age_s = _age_s(self.state_seen)
+        if age_s <= STALE_CYCLES * self._cycle_s + self._age_bound_s:
+            return True
+        self.stale_actions += 1
+        self.hold()
+        self.states.enter(State.HOLD, f"the action is for an observation {age_s:.2f} s old")
+        return False
+
+    def _look(self) -> None:
+        """Put the model where the robot is; wait, standing, for a state that may be acted on."""
         limit = time.monotonic() + FRESH_S
-        state = self._arm.arm_state()
-        while time.monotonic() - state.received_s + state.age_s > AGE_BOUND_S and not self._note_fault():
+        state = self._newest()
+        while _age_s(state) > self._age_bound_s and not self._note_fault():
             if time.monotonic() > limit:
                 self.stopped_by = "stale_observation"
-                self._arm.hold()
-                age_s = time.monotonic() - state.received_s + state.age_s
-                self.states.enter(State.FAULT, f"the robot's newest state is {age_s:.2f} s old, {FRESH_S:g} s long")
+                self.hold()
+                why = f"the robot's newest state is {_age_s(state):.2f} s old, for {FRESH_S:g} s"
+                self.states.enter(State.FAULT, why)
                 break
-            time.sleep(0.002)
-            state = self._arm.arm_state()
+            time.sleep(LOOK_S)
+            state = self._newest()
         self.state_seen = state
-        self.data.qpos[:] = state.positions
-        self.data.qvel[:] = state.velocities
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_collision(self.model, self.data)
-        self.in_collision = self.in_collision or self.data.ncon > 0
+        self._show(state)
+
+    # -- parts
+
+    def _connected(self) -> RobotT:
+        self.states.enter(State.CONNECT)
+        robot = self._connect(LATE_CYCLES * self._cycle_s)
+        self.states.enter(State.CHECK)
+        self.states.enter(State.READY)
+        return robot
 
     def _note_fault(self) -> bool:
-        fault = self._arm.fault()
+        fault = self._robot.fault
         if fault and self.states.state != State.FAULT:
             self.stopped_by = fault.partition(":")[0]
             self.states.enter(State.FAULT, fault)
         return bool(fault)
 
     def _follow_states(self) -> None:
-        """Follow the command stream's phase and the person at the terminal."""
+        """Follow what the robot does and the person at the terminal."""
         if self._note_fault() or self.states.state == State.FAULT:
             return
         if self.operator.has_taken_over:
             if self.states.state != State.HUMAN:
-                self._arm.free()
+                self._robot.free()
                 self.states.enter(State.HUMAN, "taken over")
             return
         if self.states.state == State.HUMAN:
-            self._arm.blend_in()
+            self._robot.blend_in()
             self.states.enter(State.BLEND_IN, "given back")
             return
-        phase = self._arm.phase()
+        phase = self._robot.phase
         if phase in _PHASE_STATES:
             self.states.enter(*_PHASE_STATES[phase])
         elif phase == Phase.FOLLOW:
-            self.states.enter(State.RUN if self._arm.blend() >= 1.0 else State.BLEND_IN)
+            self.states.enter(State.RUN if self._robot.blend >= 1.0 else State.BLEND_IN)
+
+
+def _age_s(state: Measured) -> float:
+    return time.monotonic() - state.received_s + state.age_s

@@ -121,7 +121,7 @@ class RtdeArm:
             state = self.arm_state()
             if np.abs(state.positions - goal).max() < REACHED and np.abs(state.velocities).max() < AT_REST:
                 break
-            if fault := self.fault():
+            if fault := self.fault:
                 raise RobotError(f"on the way to its start the robot stopped: {fault}")
             if time.monotonic() > limit:
                 away = float(np.abs(state.positions - goal).max())
@@ -135,12 +135,14 @@ class RtdeArm:
 
     # -- what the stream tells
 
+    @property
     def phase(self) -> Phase:
-        """Return what the stream does."""
+        """What the stream does."""
         return Phase(int(self._report.read()["phase"]))
 
+    @property
     def blend(self) -> float:
-        """Return the policy's share of the speed, 0 to 1."""
+        """The policy's share of the speed, 0 to 1."""
         return float(self._report.read()["blend"])
 
     def setpoint(self) -> Vector:
@@ -153,10 +155,11 @@ class RtdeArm:
         counts = self._report.read()["limited"]
         return {name: int(count) for name, count in zip(COUNTED, counts, strict=True) if count}
 
+    @property
     def fault(self) -> str:
-        """Return why the arm does not take commands any more; empty where it does."""
+        """Why the arm does not take commands any more; empty where it does."""
         if not self._fault:
-            if self._process.poll() is not None or self.phase() == Phase.FAULT:
+            if self._process.poll() is not None or self.phase == Phase.FAULT:
                 line = self._read_line(LINE_S)
                 self._fault = line.removeprefix(FAILED) or "stream_ended: the command stream's process was killed"
             elif time.monotonic() - float(self._report.read()["written_s"]) > SILENCE_S:

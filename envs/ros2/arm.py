@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.address import ARM_OPTIONS, COMMAND_TOPICS, RosAddress
-from rlservo.envs.ros2.link import open_link, take_command, wait_until
+from rlservo.envs.ros2.link import FIRST_MESSAGES_S, check_clock, open_link, take_command, wait_until
 from rlservo.envs.ros2.messages import (
     FLAG,
     INT8,
@@ -30,8 +30,6 @@ from rlservo.envs.ros2.messages import (
 if TYPE_CHECKING:
     from rlservo.envs.robots.command_stream import StreamSettings
 
-FIRST_MESSAGES_S = 30.0
-CLOCK_TOLERANCE_S = 5.0  # older than this at the first message: the clocks differ, no link is so slow
 RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of commands, where the limits name none
 RUNNING = 7
 # Distance of a joint from its setpoint beyond which it does not follow: at rest, and so much of its velocity more.
@@ -199,12 +197,7 @@ class RosArmConnection:
                 kind = own or link.publishers(topic)[0].type or INT8
                 link.subscribe(topic, kind, lambda message, name=name: self._take_mode(name, message), is_kept=True)  # type: ignore[misc]
         wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
-        age_s = self.age_s()
-        if age_s is not None and abs(age_s) > CLOCK_TOLERANCE_S:
-            raise RobotError(
-                f"{address['joint_states']} has stamps {age_s:.1f} s old: synchronise the clocks (chrony), or say "
-                "clock=robot"
-            )
+        check_clock(address["joint_states"], self.age_s() or 0.0)
 
     def _is_complete(self) -> bool:
         return self._state is not None and len(self._modes) == 3 and self._speed_percent == self._speed_percent

@@ -11,8 +11,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +28,11 @@ from rlservo.envs.mir100.parameters import (
     WIDTH,
 )
 from rlservo.envs.robots.arm import RobotError
-from rlservo.envs.robots.command_stream import Phase
+from rlservo.envs.robots.command_stream import Order, Phase
+from rlservo.envs.robots.limits import CheckedLimits
+from rlservo.envs.robots.link_delay import LinkDelay
 from rlservo.envs.ros2.address import BASE_OPTIONS, RosAddress
-from rlservo.envs.ros2.link import Endpoint, open_link, take_command, wait_until
+from rlservo.envs.ros2.link import FIRST_MESSAGES_S, Endpoint, check_clock, open_link, take_command, wait_until
 from rlservo.envs.ros2.messages import (
     FLAG,
     LASER_SCAN,
@@ -46,10 +48,8 @@ from rlservo.envs.ros2.messages import (
 )
 
 RATE_HZ = 20.0
-FIRST_MESSAGES_S = 30.0
 AGE_BOUND_S = 0.3  # [s] of what may be acted on: scans come at 12.5 Hz, or 10
 LOST_S = 2.0  # [s] without odometry, after which the connection counts as lost
-CLOCK_TOLERANCE_S = 5.0
 DEADMAN_S = 0.5  # [s], of a dead-man's message
 SCALES = (1.0, 0.75, 0.5, 0.25)  # of a velocity, tried one after the other where something is in the way
 INSTANTS = 5  # of the way to a standstill that are looked at
@@ -59,7 +59,7 @@ Twist2 = tuple[float, float]  # [m/s], [rad/s]
 
 
 @dataclass(frozen=True)
-class BaseLimits:
+class BaseLimits(CheckedLimits):
     """Limits of a base's motion; its own safety scanners stand behind them."""
 
     speed_scale: float = 1.0  # of both velocities; a first run takes 0.2
@@ -68,24 +68,10 @@ class BaseLimits:
     stop_distance: float = 0.1  # [m], of the body from what a scan sees; 0: no look at the scan
     blend_s: float = 0.5  # [s], in which the policy's share of the speed grows from 0 to 1
 
-    def __post_init__(self) -> None:
-        ranges = {
-            "speed_scale": (0.01, 1.0), "acceleration": (0.1, 2.0), "angular_acceleration": (0.1, 2.5),
-            "stop_distance": (0.0, 2.0), "blend_s": (0.0, 60.0),
-        }  # fmt: skip
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and low <= value <= high):
-                raise RobotError(f"limits: {name} is {value!r}: expected a number from {low:g} to {high:g}")
-
-    @classmethod
-    def of(cls, values: dict[str, Any]) -> BaseLimits:
-        """Return the limits with some values replaced. Raises RobotError for names that do not exist."""
-        names = [one.name for one in fields(cls)]
-        unknown = [name for name in values if name not in names]
-        if unknown:
-            raise RobotError(f"limits: {', '.join(unknown)} does not exist: expected some of {', '.join(names)}")
-        return cls(**values)
+    RANGES: ClassVar[dict[str, tuple[float, float]]] = {
+        "speed_scale": (0.01, 1.0), "acceleration": (0.1, 2.0), "angular_acceleration": (0.1, 2.5),
+        "stop_distance": (0.0, 2.0), "blend_s": (0.0, 60.0),
+    }  # fmt: skip
 
 
 class BaseState(NamedTuple):
@@ -105,18 +91,16 @@ class _Input:
         self._now_s, self._has_own_clock = now_s, has_own_clock
         self.value: Any = None
         self.received_s, self.age_s, self._made_s = 0.0, 0.0, 0.0
-        self._usual_offset_s = math.inf
+        self._delay = LinkDelay()
 
     def take(self, message: Any, value: Any) -> None:
         """Take a message in, unless it is older than the last one."""
         made_s, now = stamp_of(message), time.monotonic()
         if value is None or made_s is None or made_s <= self._made_s:
             return
-        offset = self._now_s() - made_s
-        self._usual_offset_s = min(self._usual_offset_s, offset)
-        self._made_s = made_s
-        self.value, self.received_s = value, now
-        self.age_s = offset - self._usual_offset_s if self._has_own_clock else abs(offset)
+        now_s = self._now_s()
+        self._made_s, self.value, self.received_s = made_s, value, now
+        self.age_s = self._delay.excess_s(made_s, now_s) if self._has_own_clock else abs(now_s - made_s)
 
     def age(self) -> float:
         """Return how old the newest message is now [s]."""
@@ -133,8 +117,8 @@ class RosBase:
         self.address = address = RosAddress.parse(robot, BASE_OPTIONS)
         self.limits = limits or BaseLimits()
         self._setpoint_timeout_s = setpoint_timeout_s
-        self._order: tuple[float, Twist2] = (0.0, (0.0, 0.0))  # when it was given, [m/s], [rad/s]
-        self._is_free, self._is_held, self._blend_from_s = False, True, 0.0
+        self._order, self._blend_from_s = Order.HOLD, 0.0
+        self._setpoint: tuple[float, Twist2] = (0.0, (0.0, 0.0))  # when it was given, [m/s], [rad/s]
         self._velocity: Twist2 = (0.0, 0.0)  # that is commanded
         self._counts: Counter[str] = Counter()
         self.phase, self.blend, self.fault = Phase.HOLD, 0.0, ""
@@ -155,7 +139,8 @@ class RosBase:
             if address["deadman"]:
                 link.subscribe(address["deadman"], FLAG, self._take_deadman)
             wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
-            self._check_clock()
+            for topic, one in self._inputs.items():
+                check_clock(topic, one.age_s)
             self._is_stamped = self._find_twist() == TWIST_STAMPED
             self._publish = take_command(link, address["cmd_vel"], TWIST_STAMPED if self._is_stamped else TWIST)
         except BaseException:
@@ -176,19 +161,19 @@ class RosBase:
         """Replace the velocities [m/s], [rad/s]; they hold for `setpoint_timeout_s`."""
         if not (math.isfinite(linear) and math.isfinite(angular)):
             raise ValueError(f"the velocity command is ({linear} m/s, {angular} rad/s): expected finite numbers")
-        self._order, self._is_held = (time.monotonic(), (linear, angular)), False
+        self._setpoint, self._order = (time.monotonic(), (linear, angular)), Order.FOLLOW
 
     def hold(self) -> None:
         """Decelerate and stand."""
-        self._is_held = True
+        self._order = Order.HOLD
 
-    def free(self, is_free: bool) -> None:
-        """Publish nothing any more, so that a person may drive, or command again."""
-        self._is_free = is_free
+    def free(self) -> None:
+        """Publish nothing any more, so that a person may drive."""
+        self._order = Order.FREE
 
     def blend_in(self) -> None:
         """Stand, and let the speed of the commands to come grow from 0."""
-        self._is_held, self._blend_from_s = True, time.monotonic()
+        self._order, self._blend_from_s = Order.HOLD, time.monotonic()
 
     def limited(self) -> dict[str, int]:
         """Return in how many commands each limit was kept."""
@@ -237,13 +222,6 @@ class RosBase:
     def _missing(self) -> str:
         missing = [topic for topic, one in self._inputs.items() if one.value is None]
         return f"no message with a stamp on {', '.join(missing)}"
-
-    def _check_clock(self) -> None:
-        for topic, one in self._inputs.items():
-            if one.age_s > CLOCK_TOLERANCE_S:
-                raise RobotError(
-                    f"{topic} has stamps {one.age_s:.1f} s old: synchronise the clocks (chrony), or say clock=robot"
-                )
 
     def _find_twist(self) -> str:
         """Return the message type of the command topic: as said, or as its subscribers have it."""
@@ -302,15 +280,15 @@ class RosBase:
 
     def _wanted(self) -> Twist2:
         now = time.monotonic()
-        given_s, (linear, angular) = self._order
+        given_s, (linear, angular) = self._setpoint
         odometry = next(iter(self._inputs.values()))
         if odometry.age() > LOST_S and not self.fault:
             self.fault = f"connection_lost: no odometry on {self.address['odom']} for {LOST_S:g} s"
         if self.fault:
             self.phase = Phase.FAULT
-        elif self._is_free:
+        elif self._order == Order.FREE:
             self.phase = Phase.FREE
-        elif self._is_held or self._is_closed.is_set():
+        elif self._order == Order.HOLD or self._is_closed.is_set():
             self.phase = Phase.HOLD
         elif max(one.age() for one in self._inputs.values()) > AGE_BOUND_S:
             self._note(Phase.STALE, "stale_observation")

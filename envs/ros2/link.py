@@ -11,6 +11,8 @@ from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.address import RosAddress
 
 SAID_AFTER_S = 10.0
+FIRST_MESSAGES_S = 30.0
+CLOCK_TOLERANCE_S = 5.0  # older than this at the first message: the clocks differ, no link is so slow
 LOOK_S = 0.02
 # In which every node of the graph is discovered: Fast DDS repeats its announcements every 3 s, and one may be lost.
 DISCOVERY_S = 4.0
@@ -82,6 +84,12 @@ def wait_until(condition: Callable[[], bool], what: Callable[[], str] | str, tim
             said = True
             log.warning("still waiting: %s", reason)
         time.sleep(LOOK_S)
+
+
+def check_clock(topic: str, age_s: float) -> None:
+    """Raise RobotError for stamps that are of another clock."""
+    if age_s > CLOCK_TOLERANCE_S:
+        raise RobotError(f"{topic} has stamps {age_s:.1f} s old: synchronise the clocks (chrony), or say clock=robot")
 
 
 def take_command(link: Link, topic: str, kind: str) -> Publish:

@@ -1,13 +1,12 @@
 """A real base in the place of the simulated MiR100: the environments see it through the scene's model.
 
-The model stands where odometry has the base; commands go to the base, and a control cycle passes in real time.
+The model stands where odometry has the base; commands go to the base.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -16,38 +15,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.mir100.parameters import BEAM_COUNT, CYCLE_S, LASER_MAX
 from rlservo.envs.mir100.simulation import Mir100Simulation
-from rlservo.envs.robots.command_stream import Phase
+from rlservo.envs.robots.mirror import Mirror
 from rlservo.envs.robots.operator_terminal import Operator
-from rlservo.envs.robots.states import State, StateMachine
-from rlservo.envs.ros2.base import AGE_BOUND_S, BaseLimits, RosBase
-
-FRESH_S = 6.0  # [s], for which a state that may be acted on is waited for
-STALE_CYCLES, LATE_CYCLES = 2.0, 2.5  # between an observation and its action, and between two commands
+from rlservo.envs.ros2.base import AGE_BOUND_S, BaseLimits, BaseState, RosBase
 
 Vector = NDArray[np.float64]
-_PHASE_STATES = {Phase.LATE: (State.HOLD, "no command came"), Phase.STALE: (State.HOLD, "the base's state is old")}
 
 
-class MirroredMir100(Mir100Simulation):
+class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):
     """The scene of a base that is a real one; `close` stops it."""
+
+    _is_connected = False  # `place` is called by the simulation's constructor
 
     def __init__(self, robot: str, *, needs_scan: bool, limits: Mapping[str, Any], confirm: bool) -> None:
         """Connect and wait for every input. Raises RobotError."""
-        self._is_up = False  # `place` is called by the constructor above
-        super().__init__("empty", laser_noise=0.0)
-        self._is_up = True
-        self._operator = Operator(is_asked=confirm)
-        self.states = StateMachine()
-        self._make: Callable[[], RosBase] = lambda: RosBase(
-            robot, limits=BaseLimits.of(dict(limits)), setpoint_timeout_s=LATE_CYCLES * CYCLE_S, needs_scan=needs_scan
-        )
+        checked = BaseLimits.of(dict(limits))
+
+        def connect(timeout_s: float) -> RosBase:
+            return RosBase(robot, limits=checked, setpoint_timeout_s=timeout_s, needs_scan=needs_scan)
+
+        Mir100Simulation.__init__(self, "empty", laser_noise=0.0)
         self._readings: Vector = np.full(BEAM_COUNT, LASER_MAX)
-        self._due_s = 0.0
-        self._counts: dict[str, int] = {}
-        self._lost: dict[str, int] = {}
-        self._stale_actions = 0
-        self._base = self._connected()
-        self._mirror()
+        Mirror.__init__(self, connect, Operator(is_asked=confirm), cycle_s=CYCLE_S, age_bound_s=AGE_BOUND_S)
+        self._is_connected = True
+        self._look()
 
     # -- instead of the simulation's
 
@@ -55,52 +46,25 @@ class MirroredMir100(Mir100Simulation):
         self, pose: ArrayLike, *, target: ArrayLike | None = None, cubes: Sequence[ArrayLike] | Vector | None = None
     ) -> bool:
         """Stand where the base stands, with a new target, after asking. Raises RobotError for a base that stopped."""
-        if not self._is_up:
+        if not self._is_connected:
             return super().place(pose, target=target, cubes=cubes)
-        if self.states.state == State.FAULT or self._base.fault:
-            self._note_fault()
-            self._lost = self._total()
-            self._base.close()
-            self._base = self._connected()
+        self._recover()
         self.stopped_by = None
-        self._mirror()
+        self._look()
         super().place(self.pose, target=target)
         x, y, _ = self.target
-        self._operator.confirm(f"the robot drives to {x:.2f}, {y:.2f} m in its odometry's frame")
-        if self.states.state != State.HUMAN:
-            self.states.enter(State.BLEND_IN)
-            self._base.blend_in()
-        self._operator.watch_keys()
-        self._due_s = time.monotonic()
-        self._mirror()
+        self.operator.confirm(f"the robot drives to {x:.2f}, {y:.2f} m in its odometry's frame")
+        self._begin()
+        self._look()
         return False
 
     def command(self, linear: float, angular: float) -> bool:
         """Replace the velocities [m/s], [rad/s]; return False where they are not acted on."""
         super().command(linear, angular)
-        seen = self._seen
-        age_s = time.monotonic() - seen.received_s + seen.age_s
-        if self.states.state == State.HUMAN:
-            return False
-        if age_s > STALE_CYCLES * CYCLE_S + AGE_BOUND_S:
-            self._stale_actions += 1
-            self.hold()
-            self.states.enter(State.HOLD, f"the action is for an observation {age_s:.2f} s old")
-            return False
-        self._base.command(linear, angular)
-        return True
-
-    def hold(self) -> None:
-        """Decelerate and stand."""
-        self._base.hold()
-
-    def advance(self, substeps: int = 0) -> None:  # noqa: ARG002
-        """Wait for the end of the control cycle and look at the base."""
-        now = time.monotonic()
-        self._due_s = max(self._due_s + CYCLE_S, now)  # a cycle that was missed is not caught up
-        time.sleep(self._due_s - now)
-        self._mirror()
-        self._follow_states()
+        may_act = self._may_act()
+        if may_act:
+            self._robot.command(linear, angular)
+        return may_act
 
     @property
     def scan(self) -> Vector:
@@ -112,60 +76,12 @@ class MirroredMir100(Mir100Simulation):
         """False: the base looks after itself."""
         return False
 
-    def robot_info(self) -> dict[str, Any] | None:
-        """Return the state, its changes and the limits that were kept, since the last call."""
-        counts = self._total()
-        new = {name: count - self._counts.get(name, 0) for name, count in counts.items()}
-        self._counts = counts
-        info: dict[str, Any] = {"state": self.states.state.value}
-        if any(new.values()):
-            info["limited"] = {name: count for name, count in new.items() if count}
-        if changes := self.states.take_changes():
-            info["changes"] = [change._asdict() for change in changes]
-        return info
+    # -- the mirror's
 
-    def limited(self) -> dict[str, int] | None:
-        """Return in how many commands each limit was kept, and stale actions."""
-        return self._total()
+    def _newest(self) -> BaseState:
+        return self._robot.state()
 
-    def take_over(self) -> None:
-        """Leave the base to a person from the next control cycle on, or take it back."""
-        self._operator.toggle()
-
-    def close(self) -> None:
-        """Stop the base and leave the graph."""
-        self.states.enter(State.STOP, "the environment is closed")
-        self._operator.close()
-        self._base.close()
-
-    # -- parts
-
-    def _connected(self) -> RosBase:
-        self.states.enter(State.CONNECT)
-        base = self._make()
-        self.states.enter(State.CHECK)
-        self.states.enter(State.READY)
-        return base
-
-    def _total(self) -> dict[str, int]:
-        counts = dict(self._lost)
-        for name, count in self._base.limited().items():
-            counts[name] = counts.get(name, 0) + count
-        return counts | ({"stale_action": self._stale_actions} if self._stale_actions else {})
-
-    def _mirror(self) -> None:
-        """Put the model where the base is; wait, standing, for a state that may be acted on."""
-        limit = time.monotonic() + FRESH_S
-        state = self._base.state()
-        while time.monotonic() - state.received_s + state.age_s > AGE_BOUND_S and not self._note_fault():
-            if time.monotonic() > limit:
-                self.hold()
-                self.stopped_by = "stale_observation"
-                self.states.enter(State.FAULT, f"odometry or scan is old, for {FRESH_S:g} s")
-                break
-            time.sleep(0.005)
-            state = self._base.state()
-        self._seen = state
+    def _show(self, state: BaseState) -> None:
         x, y, yaw = state.pose
         linear, angular = state.velocity
         self.data.qpos[:] = x, y, yaw
@@ -173,29 +89,3 @@ class MirroredMir100(Mir100Simulation):
         mujoco.mj_kinematics(self.model, self.data)
         if state.readings is not None:
             self._readings = state.readings
-
-    def _note_fault(self) -> bool:
-        fault = self._base.fault
-        if fault and self.states.state != State.FAULT:
-            self.stopped_by = fault.partition(":")[0]
-            self.states.enter(State.FAULT, fault)
-        return bool(fault)
-
-    def _follow_states(self) -> None:
-        if self._note_fault() or self.states.state == State.FAULT:
-            return
-        if self._operator.has_taken_over:
-            if self.states.state != State.HUMAN:
-                self._base.free(True)
-                self.states.enter(State.HUMAN, "taken over")
-            return
-        if self.states.state == State.HUMAN:
-            self._base.free(False)
-            self._base.blend_in()
-            self.states.enter(State.BLEND_IN, "given back")
-            return
-        phase = self._base.phase
-        if phase in _PHASE_STATES:
-            self.states.enter(*_PHASE_STATES[phase])
-        elif phase == Phase.FOLLOW:
-            self.states.enter(State.RUN if self._base.blend >= 1.0 else State.BLEND_IN)

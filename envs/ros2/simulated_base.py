@@ -32,6 +32,7 @@ from rlservo.envs.ros2.messages import (
     stamp_of,
 )
 from rlservo.envs.ros2.simulation_loop import FaultyLink
+from rlservo.envs.ur_controller.console import obey_link
 from rlservo.envs.ur_controller.server import Link as LinkFaults
 
 SUBSTEPS = 2  # of 0.01 s a tick: odometry at 50 Hz
@@ -94,25 +95,16 @@ class SimulatedBase:
     def obey(self, line: str) -> str:
         """Carry out a line of the console."""
         word, *rest = line.split()
-        faults = self.messages.faults
+        if word == "help":
+            return HELP
+        if word == "state":
+            pose = " ".join(f"{value:.3f}" for value in self.simulation.pose)
+            return f"pose {pose}, velocity {self.simulation.velocity[0]:.4f} {self.simulation.velocity[1]:.4f}"
+        if word != "place":
+            return obey_link(self.messages.faults, line)
         try:
-            numbers = [float(one) for one in rest]
-            if word == "help":
-                return HELP
-            if word in ("down", "up"):
-                faults.is_down = word == "down"
-            elif word == "state":
-                pose = " ".join(f"{value:.3f}" for value in self.simulation.pose)
-                return f"pose {pose}, velocity {self.simulation.velocity[0]:.4f} {self.simulation.velocity[1]:.4f}"
-            elif word == "place":
-                self.simulation.place(numbers)
-            elif word == "drop" and 0.0 <= numbers[0] <= 1.0:
-                faults.drop = numbers[0]
-            elif word in ("latency", "jitter") and 0.0 <= numbers[0] <= 10_000.0:
-                setattr(faults, f"{word}_s", numbers[0] / 1e3)
-            else:
-                return f"{line.strip()[:100]!r} is no command; help lists them"
-        except (ValueError, IndexError) as error:
+            self.simulation.place([float(one) for one in rest])
+        except ValueError as error:
             return f"{line.strip()[:100]!r}: {error}"
         return ""
 

@@ -31,7 +31,7 @@ down, up           link: cut and restored   state          where the arm is"""
 def obey(server: Simulated, line: str) -> str:
     """Carry out a line and return what to print. Call it between two control cycles (`ControllerServer.do`)."""
     word, _, rest = line.strip().partition(" ")
-    controller, link = server.controller, server.link
+    controller = server.controller
     plain: dict[str, Callable[[], object]] = {
         "protective": lambda: controller.stop_protectively("requested at the console"),
         "emergency": controller.stop_in_emergency,
@@ -39,25 +39,45 @@ def obey(server: Simulated, line: str) -> str:
         "release": controller.recover_from_emergency_stop,
         "remote": lambda: setattr(controller, "is_remote", True),
         "local": lambda: setattr(controller, "is_remote", False),
-        "down": lambda: setattr(link, "is_down", True),
-        "up": lambda: setattr(link, "is_down", False),
         "state": lambda: _state(server),
         "help": lambda: HELP,
     }
     if word in plain and not rest:
         return str(plain[word]() or "")
-    scales = {"slider": 1.0, "latency": 1e-3, "jitter": 1e-3, "drop": 1.0}
-    try:
-        value = float(rest) * scales[word]
-    except (KeyError, ValueError):
-        return f"{line.strip()[:100]!r} is not a command; help lists them"
-    if not 0.0 <= value <= (10.0 if word in ("latency", "jitter") else 1.0):
-        return f"{word} {rest}: expected 0 to {'10000 ms' if word in ('latency', 'jitter') else '1'}"
     if word == "slider":
-        controller.speed_fraction = value
-    else:
-        setattr(link, "drop" if word == "drop" else f"{word}_s", value)
+        try:
+            controller.speed_fraction = _number(word, rest, 1.0)
+        except ValueError as error:
+            return str(error)
+        return ""
+    return obey_link(server.link, line)
+
+
+def obey_link(link: Link, line: str) -> str:
+    """Carry out a line about the link's faults and return what to print."""
+    word, _, rest = line.strip().partition(" ")
+    try:
+        if word in ("down", "up") and not rest:
+            link.is_down = word == "down"
+        elif word == "drop":
+            link.drop = _number(word, rest, 1.0)
+        elif word in ("latency", "jitter"):
+            setattr(link, f"{word}_s", _number(word, rest, 10_000.0, " ms") / 1e3)
+        else:
+            return f"{line.strip()[:100]!r} is not a command; help lists them"
+    except ValueError as error:
+        return str(error)
     return ""
+
+
+def _number(word: str, text: str, most: float, unit: str = "") -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value <= most:
+        raise ValueError(f"{word} {text[:100]}: expected 0 to {most:g}{unit}")
+    return value
 
 
 def _state(server: Simulated) -> str:

@@ -173,7 +173,7 @@ def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningA
         for bad in (np.full(6, np.nan), np.full(5, 0.0)):
             with pytest.raises(ValueError, match="expected 6 finite joint positions"):
                 real.command(bad)
-        assert not real.fault()
+        assert not real.fault
         counts = real.limited()
         assert counts and ("late_setpoint" in counts or stream != "silence")
     finally:

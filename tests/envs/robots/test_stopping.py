@@ -73,7 +73,7 @@ def test_killed_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, movin
     assert time_to_stand(arm, lambda: os.kill(moving.pid, signal.SIGKILL)) < WATCHDOG_S + BRAKING_S
     arm.wait_until(lambda: not arm.controller.is_program_running)
     assert "watchdog" in arm.controller.stop_reasons[-1][1]
-    assert "killed" in moving.fault()
+    assert "killed" in moving.fault
 
 
 def test_suspended_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
@@ -82,22 +82,22 @@ def test_suspended_command_stream_is_stopped_by_the_watchdog(arm: RunningArm, mo
         arm.wait_until(lambda: not arm.controller.is_program_running)
     finally:
         os.kill(moving.pid, signal.SIGCONT)
-    arm.wait_until(lambda: bool(moving.fault()))
+    arm.wait_until(lambda: bool(moving.fault))
     # Which of them is seen first: the program that ended, or what it no longer takes.
-    assert moving.fault().partition(":")[0] in ("program_stopped", "connection_lost", "command_refused")
+    assert moving.fault.partition(":")[0] in ("program_stopped", "connection_lost", "command_refused")
 
 
 def test_link_that_is_down_is_stopped_by_the_watchdog(arm: RunningArm, moving: RtdeArm) -> None:
     link = arm.server.link
     assert time_to_stand(arm, lambda: setattr(link, "is_down", True)) < WATCHDOG_S + BRAKING_S
-    arm.wait_until(lambda: bool(moving.fault()))
+    arm.wait_until(lambda: bool(moving.fault))
     link.is_down = False
 
 
 def test_emergency_stop_is_a_fault_that_is_named(arm: RunningArm, moving: RtdeArm) -> None:
     assert time_to_stand(arm, lambda: arm.do(arm.controller.stop_in_emergency)) < BRAKING_S
-    arm.wait_until(lambda: bool(moving.fault()))
-    assert moving.fault().startswith("emergency_stop")
+    arm.wait_until(lambda: bool(moving.fault))
+    assert moving.fault.startswith("emergency_stop")
     with pytest.raises(RobotError, match="emergency stop"):
         RtdeArm(arm.host, "ur5")
 
@@ -173,8 +173,8 @@ def test_network_whose_link_goes_down_is_stopped_by_the_watchdog(
         assert time_to_stand(arm, lambda: set_link("down")) < WATCHDOG_S + BRAKING_S
         arm.wait_until(lambda: not arm.controller.is_program_running)
         assert "watchdog" in arm.controller.stop_reasons[-1][1]
-        arm.wait_until(lambda moving=moving: bool(moving.fault()))  # type: ignore[misc]
-        assert moving.fault().startswith("connection_lost")
+        arm.wait_until(lambda moving=moving: bool(moving.fault))  # type: ignore[misc]
+        assert moving.fault.startswith("connection_lost")
 
 
 def test_server_that_hangs_or_is_killed_leaves_a_standing_arm(arm: RunningArm, shipped: Path) -> None:

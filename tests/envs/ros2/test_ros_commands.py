@@ -20,11 +20,11 @@ from rlservo.envs.robots.rtde_arm import RtdeArm
 arm = RtdeArm("ros2:command=" + sys.argv[1], "ur5", velocity_scale=0.1, limits=Limits.of({"blend_s": 0.1}))
 print("stream", arm.pid, flush=True)
 start = arm.arm_state().positions
-while not arm.fault():
+while not arm.fault:
     side = 1.0 if time.monotonic() % 4.0 < 2.0 else -1.0
     arm.command(start + np.array([side * 3.0, 0, 0, 0, 0, 0]), 3.0)
     time.sleep(0.05)
-print("fault", arm.fault(), flush=True)
+print("fault", arm.fault, flush=True)
 arm.close()
 """
 
