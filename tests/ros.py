@@ -100,6 +100,7 @@ class Ros:
         self.environment = {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_LOCALHOST_ONLY": "1"}
         self._cleanup = contextlib.ExitStack()
         self._graph: Process | None = None
+        self._states = ""
 
     def rlservo(self, *words: object) -> Process:
         """Start a command of rlservo's."""
@@ -133,24 +134,60 @@ class Ros:
             assert time.monotonic() < limit, "the condition never came true"
             time.sleep(0.1)
 
-    def heartbeat(self) -> dict[str, str]:
-        """Return what the next heartbeat says."""
+    # -- a node of rlservo's
+
+    def heartbeat(self, node: str = "rlservo") -> dict[str, str]:
+        """Return what a node's next heartbeat says."""
         began_s, beats = time.time(), []
-        self.wait_until(lambda: beats.extend(self.ask("since", topic="/diagnostics", time_s=began_s)) or bool(beats))
-        status = beats[-1][1]["status"][0]
-        return {"message": status["message"], **{one["key"]: one["value"] for one in status["values"]}}
+
+        def look() -> bool:
+            found = [message["status"][0] for _, message in self.ask("since", topic="/diagnostics", time_s=began_s)]
+            beats.extend(one for one in found if one["name"] == f"/{node}: policy")
+            return bool(beats)
+
+        self.wait_until(look)
+        return {"message": beats[-1]["message"], **{one["key"]: one["value"] for one in beats[-1]["values"]}}
+
+    def give_target(self, x: float, y: float, z: float = 0.0, frame: str = "base_link") -> None:
+        """Publish a target [m]."""
+        self.ask(
+            "publish", topic="/rlservo/target", kind="geometry_msgs/msg/PoseStamped",
+            values={"header": {"frame_id": frame}, "pose": {"position": {"x": x, "y": y, "z": z}}},
+        )  # fmt: skip
+
+    def drive_to(self, *target: float, frame: str = "base_link") -> dict[str, str]:
+        """Return the heartbeat after a target has been driven to."""
+        episodes = int(self.heartbeat()["episodes"])
+        self.give_target(*target, frame=frame)
+        self.wait_until(
+            lambda: int((beat := self.heartbeat())["episodes"]) > episodes and beat["state"] not in ("running", "hold")
+        )
+        return self.heartbeat()
+
+    # -- a robot
+
+    def watch(self, topic: str, kind: str) -> None:
+        """Take the robot's speed from its states on a topic."""
+        self._states = topic
+        self.ask("subscribe", topic=topic, kind=kind)
+        self.ask("subscribe", topic="/diagnostics", kind="diagnostic_msgs/msg/DiagnosticArray")
 
     def speed(self) -> float:
-        """Return how fast the fastest joint is now [rad/s]."""
-        states = self.ask("since", topic="/joint_states", time_s=0.0, count=1)
-        return max(map(abs, states[-1][1]["velocity"])) if states else 0.0
+        """Return how fast the fastest joint [rad/s] or the base [m/s] is now."""
+        states = self.ask("since", topic=self._states, time_s=0.0, count=1)
+        return speed_of(states[-1][1]) if states else 0.0
 
     def moved_for(self, began_s: float) -> float:
-        """Wait until the arm stands, and return for how long it moved on after a moment [s since 1970]."""
+        """Wait until the robot stands, and return for how long it moved on after a moment [s since 1970]."""
         self.wait_until(lambda: time.time() > began_s + 0.2 and self.speed() < STANDS)
-        states = self.ask("since", topic="/joint_states", time_s=began_s)
-        fast = [state["header"]["stamp"] for _, state in states if max(map(abs, state["velocity"])) > STANDS]
+        states = self.ask("since", topic=self._states, time_s=began_s)
+        fast = [state["header"]["stamp"] for _, state in states if speed_of(state) > STANDS]
         return max((at["sec"] + at["nanosec"] * 1e-9 for at in fast), default=began_s) - began_s
+
+
+def speed_of(state: dict[str, Any]) -> float:
+    """Return the speed in a JointState [rad/s] or an Odometry [m/s]."""
+    return max(map(abs, state["velocity"] if "velocity" in state else state["twist"]["twist"]["linear"].values()))
 
 
 @pytest.fixture(scope="module")

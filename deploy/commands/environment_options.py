@@ -7,6 +7,7 @@ import os
 from typing import Any
 
 from rlservo.export.contract.errors import UsageError
+from rlservo.export.contract.extras import require
 
 
 def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:
@@ -21,6 +22,14 @@ def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:
         except json.JSONDecodeError:
             arguments[name] = value
     return arguments
+
+
+def require_robot(robot: str) -> None:
+    """Raise UsageError where the package that reaches a robot is not installed."""
+    if robot.startswith("rosbridge://"):
+        require("rosbridge", "roslibpy", what="a rosbridge")
+    elif not robot.startswith("ros2:"):  # which names its own lack: ROS 2 is no package of PyPI's
+        require("ur", "rtde_control", what="a real robot")
 
 
 def choose_gl_backend() -> None:

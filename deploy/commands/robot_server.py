@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.deploy.commands.environment_options import parse_env_arguments
+from rlservo.deploy.commands.environment_options import parse_env_arguments, require_robot
 from rlservo.deploy.terminal import Json, print_json
 from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra, require
+from rlservo.export.contract.extras import needs_extra
 
 if TYPE_CHECKING:
     from rlservo.envs.robot_server.settings import Settings
@@ -212,7 +212,7 @@ def server_manager(
 
 
 def robot_latency(
-    robot: Annotated[str, typer.Argument(metavar="rtde://HOST", help="Address of the arm.")],
+    robot: Annotated[str, typer.Argument(metavar="ADDRESS", help="rtde://HOST, or ros2:NAME=VALUE,...")],
     ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
@@ -226,7 +226,7 @@ def robot_latency(
 
     Example: `rlservo robot-latency rtde://192.168.0.2 --ur-model ur5e`
     """
-    require("ur", "rtde_control")
+    require_robot(robot)
     with _one_sentence_errors():
         from rlservo.envs.robots.arm import RobotError, host_of
         from rlservo.envs.robots.latency import STEP, measure_latency
@@ -236,7 +236,7 @@ def robot_latency(
 
         host = host_of(robot)
         if host is None:
-            raise RobotError(f"robot {robot!r} is simulated: expected rtde://HOST")
+            raise RobotError(f"robot {robot!r} is simulated: expected rtde://HOST or ros2:")
         Operator(is_asked=not yes).confirm(f"wrist_3 of the robot at {host} turns by {STEP:g} rad, {steps} times")
         arm = RtdeArm(host, ur_model, setpoint_timeout_s=0.5, limits=Limits.of(parse_env_arguments(limit or [])))
         try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.deploy.commands.environment_options import choose_gl_backend, parse_env_arguments
+from rlservo.deploy.commands.environment_options import choose_gl_backend, parse_env_arguments, require_robot
 from rlservo.deploy.terminal import Json, print_json
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra, require
@@ -82,7 +82,7 @@ def rollout(
         raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
     arguments = parse_env_arguments(env_arg or []) | ({"confirm": False} if yes else {})
     if "robot" in arguments:
-        _require_robot(str(arguments["robot"]))
+        require_robot(str(arguments["robot"]))
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     if video is not None:
         choose_gl_backend()
@@ -118,14 +118,6 @@ def rollout(
         raise typer.Exit(130)
     if report.stopped is not None:
         raise typer.Exit(1)
-
-
-def _require_robot(robot: str) -> None:
-    """Raise UsageError where the package that reaches a robot is not installed."""
-    if robot.startswith("rosbridge://"):
-        require("rosbridge", "roslibpy", what="a rosbridge")
-    elif not robot.startswith("ros2:"):  # which names its own lack: ROS 2 is no package of PyPI's
-        require("ur", "rtde_control", what="a real robot")
 
 
 def acting_policy(

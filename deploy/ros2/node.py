@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -18,11 +19,12 @@ from rlservo.envs.ros2.messages import DIAGNOSTICS, POSE_STAMPED, stamp
 from rlservo.envs.ros2.rclpy_link import RclpyLink
 from rlservo.envs.ur.parameters import JOINTS
 from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import RlservoError, UsageError
+from rlservo.export.contract.errors import DeadlineError, RlservoError, UsageError
 from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.environment import check_fit, check_proven, make_env
 
 HEARTBEAT_S = 0.5
+AGAIN_S = 1.0  # until a robot that could not be connected to is tried again
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # DiagnosticStatus' levels
 # Environments of ours by the simulated one that a policy was trained in, and the frame of their target.
 REAL = {
@@ -36,6 +38,7 @@ MEANINGS = ("ur_model", "restrict_wrist_1", "action_cycle_rate", "max_velocity_s
     f"fix_{joint}" for joint in JOINTS
 ))  # fmt: skip
 
+NUMBER = re.compile(r"[\d.]+")  # an age, say: it differs in each cycle
 log = logging.getLogger("rlservo.ros2")
 
 
@@ -82,11 +85,10 @@ class PolicyNode:
         return found
 
     def enter(self, state: str, why: str = "") -> None:
-        """Change the state: one line in the log, and in the heartbeat."""
-        if (state, why) != (self.state, self.why):
-            if state != self.state or state == "holding":
-                log.info("node: %s -> %s%s", self.state, state, f": {why}" if why else "")
-            self.state, self.why = state, why
+        """Change the state: a line in the log where more than a number of it is new, and the next heartbeat."""
+        if (state, NUMBER.sub("", why)) != (self.state, NUMBER.sub("", self.why)):
+            log.info("node: %s -> %s%s", self.state, state, f": {why}" if why else "")
+        self.state, self.why = state, why
 
     def close(self) -> None:
         """Leave the graph."""
@@ -105,7 +107,7 @@ class PolicyNode:
         while not self._is_closed.wait(HEARTBEAT_S):
             contract = self.policy.contract
             facts = {"state": self.state, "policy": contract.name, "version": contract.version, **self.counts}
-            level = {"fault": ERROR, "holding": WARN, "waiting": WARN}.get(self.state, OK)
+            level = {"fault": ERROR, "holding": WARN, "waiting": WARN, "refused": WARN}.get(self.state, OK)
             status = {
                 "level": level,
                 "name": f"{self.link.node.get_fully_qualified_name()}: policy",
@@ -142,8 +144,12 @@ def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | 
                 policy.reset()
                 node.counts["episodes"] += 1
             was_running = True
+            began = time.monotonic()
             try:
-                outputs.act(np.asarray(policy.act(observation)))
+                action = np.asarray(policy.act(observation))
+                if (took_s := time.monotonic() - began) > inputs.max_age_s:
+                    raise DeadlineError(f"the action came {took_s:.2f} s late, more than {inputs.max_age_s:g} s")
+                outputs.act(action)
                 node.enter("running")
                 node.counts["decisions"] += 1
             except RlservoError as error:  # late, unreachable, refused: nothing is commanded in this cycle
@@ -187,7 +193,7 @@ def drive_environment(
             if node.wanted is not Wanted.RUN:
                 node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
             elif target.number == done:
-                if node.state not in ("arrived", "fault"):
+                if node.state not in ("arrived", "fault", "refused"):
                     node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
             else:
                 done = _drive_to(node, stop, env, option, target)
@@ -207,12 +213,16 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
     try:
         observation, _ = env.reset(options=options)
     except ValueError as error:  # the robot's refusal, or a target that cannot be
-        node.enter("fault" if isinstance(error, RobotError) else "waiting", str(error))
-        time.sleep(1.0)
-        return number if not isinstance(error, RobotError) else number - 1
+        why = str(error)
+        if not isinstance(error, RobotError):
+            node.enter("refused", why)
+            return number
+        node.enter("fault", why)
+        time.sleep(AGAIN_S)
+        # What has stopped a robot is a word before the sentence. It must not move by itself once that is mended.
+        return number if why.partition(":")[0].isidentifier() else number - 1
     policy.reset()
-    node.counts["episodes"] += 1
-    node.enter("running", "")
+    is_first = True
     while not stop.is_set() and node.wanted is Wanted.RUN and target.number == number:
         try:
             action = policy.act(observation)
@@ -220,7 +230,10 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
             node.enter("holding", error.message)
             node.counts["late"] += 1
             robot.simulation.hold()
+            robot.simulation.advance()
             return number - 1
+        node.counts["episodes"] += is_first
+        is_first = False
         observation, reward, terminated, truncated, info = env.step(action)
         node.counts["decisions"] += 1
         is_over = terminated or truncated

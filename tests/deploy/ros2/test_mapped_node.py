@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import subprocess
 import sys
@@ -15,8 +16,12 @@ import pytest
 
 from bundles import write_box_policy
 from environments import environment_with
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.settings import ServerSettings
 from ros import PYTHON, Process, Ros
+from servers import free_ports, over_uvicorn
+from stores import load_store
 
 JOINTS = ("shoulder", "elbow", "wrist")
 COMMANDS, REST = "/forward_command_controller/commands", "/rest"
@@ -66,8 +71,21 @@ def actions_since(ros: Ros, time_s: float) -> list[list[float]]:
     return [message["data"] for _, message in ros.ask("since", topic=COMMANDS, time_s=time_s)]
 
 
-def until_state(ros: Ros, text: str, meanwhile: Any = lambda: None) -> None:
-    ros.wait_until(lambda: (meanwhile(), text in ros.heartbeat()["message"])[1])
+def until_state(ros: Ros, text: str, meanwhile: Any = lambda: None, node: str = "rlservo") -> None:
+    ros.wait_until(lambda: (meanwhile(), text in ros.heartbeat(node)["message"])[1])
+
+
+class SlowServer:
+    """An application whose answers take `delay_s`."""
+
+    def __init__(self, folder: Path) -> None:
+        store = load_store(folder)
+        self._app, self.delay_s = create_app(lambda: store, ServerSettings()), 0.0
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "http":
+            await asyncio.sleep(self.delay_s)
+        await self._app(scope, receive, send)
 
 
 def test_node_waits_for_every_input_and_a_start_then_acts_on_ordered_joints(
@@ -104,6 +122,33 @@ def test_stale_stamps_a_lost_topic_and_a_missing_joint_are_not_acted_on(ros: Ros
         until_state(ros, "running", lambda: send(ros, joints))
     ros.ask("call", service="/rlservo/hold")
     until_state(ros, "holding: asked for", lambda: send(ros, joints))
+
+
+def test_node_holds_for_a_slow_and_for_a_lost_server_and_goes_on(ros: Ros, bundle: Path) -> None:
+    commands, joints = "/served/action", dict.fromkeys(JOINTS, 0.0)
+    ros.ask("subscribe", topic=commands, kind="std_msgs/msg/Float64MultiArray")
+    ros.ask("subscribe", topic="/diagnostics", kind="diagnostic_msgs/msg/DiagnosticArray")
+    (port,) = free_ports(1)
+    words = ("ros2", "--url", f"http://127.0.0.1:{port}", "--name", "served", "--max-age", MAX_AGE_S, "--autostart")
+
+    def act() -> None:
+        send(ros, joints)
+
+    app = SlowServer(bundle.parents[1])
+    with over_uvicorn(app, port):
+        ros.rlservo(*words, "--mapping", mapping(bundle / "served.yaml"))
+        until_state(ros, "running", act, "served")
+        app.delay_s = MAX_AGE_S + 0.4
+        until_state(ros, "holding: the action came", act, "served")
+        before = len(ros.ask("since", topic=commands, time_s=0.0))
+        late = int(ros.heartbeat("served")["late"])
+        ros.wait_until(lambda: (act(), int(ros.heartbeat("served")["late"]) > late + 2)[1])
+        assert len(ros.ask("since", topic=commands, time_s=0.0)) == before
+        app.delay_s = 0.0
+        until_state(ros, "running", act, "served")
+    until_state(ros, "cannot be reached", act, "served")
+    with over_uvicorn(SlowServer(bundle.parents[1]), port):
+        until_state(ros, "running", act, "served")
 
 
 def test_second_node_on_the_same_topic_is_refused(ros: Ros, node: Process, bundle: Path) -> None:

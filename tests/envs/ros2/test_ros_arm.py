@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
@@ -16,6 +17,7 @@ from ros import Process, Ros
 
 TARGETS = int(os.environ.get("RLSERVO_ROS_TARGETS", "3"))
 PREFIX = "left_"
+RESEND = "/io_and_status_controller/resend_robot_program"
 FAST = 0.2  # [rad/s]
 BRAKING_S = 1.0  # at 5 rad/s^2, servoj's lag and a busy machine
 
@@ -25,8 +27,7 @@ def sim(ros: Ros) -> Process:
     """A UR5 whose joints have a prefix; its driver's joint states are in another order than ours."""
     sim = ros.rlservo("ros2-sim", "ur5", "--prefix", PREFIX)
     sim.wait_for("ur5 on ROS 2")
-    ros.ask("subscribe", topic="/joint_states", kind="sensor_msgs/msg/JointState")
-    ros.ask("subscribe", topic="/diagnostics", kind="diagnostic_msgs/msg/DiagnosticArray")
+    ros.watch("/joint_states", "sensor_msgs/msg/JointState")
     return sim
 
 
@@ -48,29 +49,15 @@ def start_node(ros: Ros, all_shipped: Path, *options: object) -> Process:
     )  # fmt: skip
 
 
-def give_target(ros: Ros, turn: float, radius: float = 0.5, height: float = 0.4) -> None:
-    """Publish a target, `turn` [rad] from where the arm points at its start."""
-    position = {"x": -radius * math.cos(turn), "y": -radius * math.sin(turn), "z": height}
-    ros.ask(
-        "publish", topic="/rlservo/target", kind="geometry_msgs/msg/PoseStamped",
-        values={"header": {"frame_id": "base_link"}, "pose": {"position": position}},
-    )  # fmt: skip
-
-
-def drive_to(ros: Ros, turn: float, radius: float, height: float) -> dict[str, str]:
-    """Return the heartbeat after a target has been driven to."""
-    episodes = int(ros.heartbeat()["episodes"])
-    give_target(ros, turn, radius, height)
-    ros.wait_until(
-        lambda: int((beat := ros.heartbeat())["episodes"]) > episodes and beat["state"] not in ("running", "hold")
-    )
-    return ros.heartbeat()
+def place(turn: float, radius: float = 0.5, height: float = 0.4) -> tuple[float, float, float]:
+    """Return a target [m], `turn` [rad] from where the arm points at its start."""
+    return -radius * math.cos(turn), -radius * math.sin(turn), height
 
 
 def get_moving(ros: Ros, side: float) -> None:
     """Send the arm to one side, from the other, and wait until it is fast."""
-    drive_to(ros, -1.2 * side, 0.5, 0.4)
-    give_target(ros, 1.2 * side)
+    ros.drive_to(*place(-1.2 * side))
+    ros.give_target(*place(1.2 * side))
     ros.wait_until(lambda: ros.speed() > FAST)
 
 
@@ -79,7 +66,7 @@ def test_policy_reaches_its_targets_through_topics(ros: Ros, sim: Process, node:
     draw = np.random.default_rng(5)
     outcomes = []
     for _ in range(TARGETS):
-        beat = drive_to(ros, draw.uniform(-1.0, 1.0), draw.uniform(0.35, 0.6), draw.uniform(0.15, 0.5))
+        beat = ros.drive_to(*place(draw.uniform(-1.0, 1.0), draw.uniform(0.35, 0.6), draw.uniform(0.15, 0.5)))
         outcomes.append(beat["message"])
     assert outcomes.count("arrived: success") >= len(outcomes) - len(outcomes) // 20, outcomes
     assert ros.ask("call", service="/rlservo/version")["message"].split()[1] == "1"
@@ -140,3 +127,42 @@ def test_killed_processes_leave_a_standing_arm(ros: Ros, sim: Process, node: Pro
     node.process.kill()
     assert ros.moved_for(began_s) < BRAKING_S
     ros.wait_until(lambda: not Path(f"/proc/{stream}").exists())
+
+
+def test_process_that_does_not_run_stops_the_arm_and_goes_on_later(ros: Ros, sim: Process, node: Process) -> None:
+    node.wait_for("check -> ready")
+    get_moving(ros, 1.0)
+    for is_stream, silence_s in ((False, 0.25), (True, 0.0)):
+        pid = node.children()[0] if is_stream else node.process.pid
+        began_s = time.time()
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            assert ros.moved_for(began_s) < silence_s + BRAKING_S
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        get_moving(ros, 1.0)
+
+
+def test_stopped_robot_does_not_move_again_before_a_new_target(ros: Ros, sim: Process, node: Process) -> None:
+    node.wait_for("check -> ready")
+    get_moving(ros, 1.0)
+    sim.type("protective")
+    node.wait_for("fault: protective_stop")
+    seen = len(node.lines)
+    ros.give_target(*place(0.0))
+    ros.wait_until(lambda: ros.heartbeat()["message"].startswith("fault: protective_stop"))
+    sim.type("unlock")
+    ros.wait_until(lambda: (sim.type("unlock"), ros.ask("call", service=RESEND)["success"])[1])
+    assert not [line for line in node.lines[seen:] if "ready" in line]
+    get_moving(ros, 1.0)
+
+
+def test_latency_of_the_arm_is_measured_through_topics(ros: Ros, sim: Process) -> None:
+    words = ("robot-latency", f"ros2:prefix={PREFIX}", "--ur-model", "ur5", "--steps", 5, "--yes", "--json")
+    measuring = ros.rlservo(*words)
+    assert measuring.end(0) == 0, measuring.lines
+    text = "\n".join(measuring.lines)
+    report = json.loads(text[text.index("{\n") :])
+    assert report["steps"] == 5
+    assert 0.0 < report["p50_ms"] <= report["max_ms"]
+    assert report["disturbance"] == f"latency={report['cycles']},noise=real"

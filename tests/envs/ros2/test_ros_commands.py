@@ -34,7 +34,7 @@ def test_killed_stream_leaves_a_standing_arm_with(how: str, ros: Ros) -> None:
     sim = ros.rlservo("ros2-sim", "ur5", "--controller", how)
     sim.wait_for(f"{how} controller")
     ros.wait_until(lambda: set(ros.ask("publishers", topic="/joint_states")) == {"ur_ros2_driver_sim"})
-    ros.ask("subscribe", topic="/joint_states", kind="sensor_msgs/msg/JointState")
+    ros.watch("/joint_states", "sensor_msgs/msg/JointState")
     driver = ros.python("-c", PROGRAM, how)
     stream = int(driver.wait_for("stream").split()[1])
     helpers = [int(pid) for pid in Path(f"/proc/{stream}/task/{stream}/children").read_text().split()]
