@@ -61,7 +61,7 @@ class PolicyNode:
     """A node `rlservo`; `run` drives until `stop` is set. Its services answer at once, the loop follows."""
 
     def __init__(self, policy: ActingPolicy, name: str, *, autostart: bool) -> None:
-        """Join the graph. Raises RobotError without rclpy, or where a node of that name is there already."""
+        """Join the graph. Raises RobotError without rclpy."""
         self.policy = policy
         self.link = RclpyLink(name, is_unique=True)
         self.state, self.why = "waiting", ""

@@ -56,7 +56,7 @@ class RosArmConnection:
         self._joints = [address["prefix"] + name for name in JOINT_NAMES.values()]
         self._lock = threading.Lock()
         self._state: tuple[float, float | None, Vector, Vector] | None = None  # stamp, age, positions, velocities
-        self._problem = f"no message on {address['joint_states']}"
+        self._problem = f"no message on {address['joint_states']}: is the driver running, and ROS_DOMAIN_ID its own"
         self._speed_percent = 100.0 if address["status"] == "off" else float("nan")
         self._modes: dict[str, int] = {"program_running": 1, "robot_mode": RUNNING, "safety_mode": 1}
         self._setpoint: Vector | None = None
@@ -217,7 +217,7 @@ class RosArmConnection:
             names = ", ".join(message.name)
             self._problem = f"{self._address['joint_states']} lacks some of {', '.join(self._joints)}: it has {names}"
         elif made_s is None:
-            self._problem = f"{self._address['joint_states']} has no stamps"
+            self._problem = f"{self._address['joint_states']} has no stamps: its driver must set them"
         elif self._state is None or made_s > self._state[0]:
             age_s = None if self._address["clock"] == "robot" else abs(self._link.now_s() - made_s)
             self._state = (made_s, age_s, positions, velocities)

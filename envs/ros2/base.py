@@ -221,7 +221,7 @@ class RosBase:
 
     def _missing(self) -> str:
         missing = [topic for topic, one in self._inputs.items() if one.value is None]
-        return f"no message with a stamp on {', '.join(missing)}"
+        return f"no message with a stamp on {', '.join(missing)}: is the base's driver running"
 
     def _find_twist(self) -> str:
         """Return the message type of the command topic: as said, or as its subscribers have it."""
@@ -283,7 +283,7 @@ class RosBase:
         given_s, (linear, angular) = self._setpoint
         odometry = next(iter(self._inputs.values()))
         if odometry.age() > LOST_S and not self.fault:
-            self.fault = f"connection_lost: no odometry on {self.address['odom']} for {LOST_S:g} s"
+            self.fault = f"connection_lost: no odometry on {self.address['odom']} for {LOST_S:g} s: see its network"
         if self.fault:
             self.phase = Phase.FAULT
         elif self._order == Order.FREE:

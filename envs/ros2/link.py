@@ -112,7 +112,7 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
     except RobotError:
         types = {one.type for one in link.subscribers(topic)} - {kind}
         if types:
-            raise RobotError(f"{topic} takes {', '.join(sorted(types))}, not {kind}") from None
+            raise RobotError(f"{topic} takes {', '.join(sorted(types))}, not {kind}: name another topic") from None
         raise
     publish = link.advertise(topic, kind)
     # Of two that come at once each sees the other, and neither commands.

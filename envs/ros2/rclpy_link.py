@@ -7,6 +7,7 @@ import functools
 import importlib
 import os
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -42,6 +43,7 @@ class RclpyLink:
             name if is_unique else f"{name}_{os.getpid()}", context=self._context,
             automatically_declare_parameters_from_overrides=is_unique,
         )  # fmt: skip
+        self._own: Counter[tuple[str, str]] = Counter()  # endpoints of ours, by topic
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 
@@ -58,12 +60,15 @@ class RclpyLink:
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
         """Subscribe as sensors' topics are: the newest message, best effort; a kept one reliably."""
-        self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), self._qos(is_kept, False))
+        qos = self._qos(is_kept, False)
+        made = self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), qos)
+        self._own["subscriber", made.topic_name] += 1
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
         """Publish reliably, the newest message alone."""
         made = message_class(kind)
         publisher = self.node.create_publisher(made, topic, self._qos(is_kept, True))
+        self._own["publisher", publisher.topic_name] += 1
 
         def publish(values: Mapping[str, Any]) -> None:
             if self._context.ok():
@@ -82,7 +87,7 @@ class RclpyLink:
 
     def publishers(self, topic: str) -> list[Endpoint]:
         """Return the publishers of other nodes."""
-        return self._others(self.node.get_publishers_info_by_topic(topic))
+        return self._others("publisher", topic, self.node.get_publishers_info_by_topic(topic))
 
     def rivals(self, topic: str) -> list[Endpoint]:
         """Return the publishers of other nodes: a robot obeys one. A guard is none."""
@@ -90,7 +95,7 @@ class RclpyLink:
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         """Return the subscribers of other nodes."""
-        return self._others(self.node.get_subscriptions_info_by_topic(topic))
+        return self._others("subscriber", topic, self.node.get_subscriptions_info_by_topic(topic))
 
     def close(self) -> None:
         """Leave the graph and end the thread."""
@@ -99,13 +104,16 @@ class RclpyLink:
         self._thread.join(2.0)
         self.node.destroy_node()
 
-    def _others(self, infos: Sequence[Any]) -> list[Endpoint]:
-        own = (self.node.get_name(), self.node.get_namespace())
-        return [
-            Endpoint(f"{one.node_namespace.rstrip('/')}/{one.node_name}", one.topic_type)
-            for one in infos
-            if (one.node_name, one.node_namespace) != own
-        ]
+    def _others(self, which: str, topic: str, infos: Sequence[Any]) -> list[Endpoint]:
+        found = [Endpoint(f"{one.node_namespace.rstrip('/')}/{one.node_name}", one.topic_type) for one in infos]
+        own, others = self.node.get_fully_qualified_name(), []
+        mine = self._own[which, self.node.resolve_topic_name(topic)]
+        for one in found:  # another node may have our name
+            if one.node == own and mine:
+                mine -= 1
+            else:
+                others.append(one)
+        return others
 
     @staticmethod
     def _qos(is_kept: bool, is_reliable: bool) -> Any:

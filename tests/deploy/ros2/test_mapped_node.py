@@ -151,8 +151,9 @@ def test_node_holds_for_a_slow_and_for_a_lost_server_and_goes_on(ros: Ros, bundl
         until_state(ros, "running", act, "served")
 
 
-def test_second_node_on_the_same_topic_is_refused(ros: Ros, node: Process, bundle: Path) -> None:
-    second = ros.rlservo("ros2", "--bundle", bundle, "--name", "second", "--ros-args", "-r", f"~/action:={COMMANDS}")
+@pytest.mark.parametrize("name", ["second", "rlservo"])
+def test_second_node_on_the_same_topic_is_refused(ros: Ros, node: Process, bundle: Path, name: str) -> None:
+    second = ros.rlservo("ros2", "--bundle", bundle, "--name", name, "--ros-args", "-r", f"~/action:={COMMANDS}")
     line = second.wait_for("is commanded by")
     assert "/rlservo already: end it first" in line
     assert second.end(0) == 2
