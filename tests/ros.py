@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import random
 import selectors
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +20,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON = ROOT / ".ros" / "bin" / "python"
 PATIENCE_S = 90.0
+REPEAT_S = 5.0
+DOMAINS = range(1, 101)  # whose ports are below those that the system gives to outgoing connections
 STANDS = 0.01  # [rad/s], [m/s]
 
 
@@ -97,8 +101,8 @@ class Ros:
     """A graph of its own: nobody else's nodes are in it."""
 
     def __init__(self) -> None:
-        self.environment = {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_LOCALHOST_ONLY": "1"}
         self._cleanup = contextlib.ExitStack()
+        self.environment = {"ROS_DOMAIN_ID": str(self._free_domain()), "ROS_LOCALHOST_ONLY": "1"}
         self._graph: Process | None = None
         self._states = ""
 
@@ -114,6 +118,19 @@ class Ros:
 
     def close(self) -> None:
         self._cleanup.close()
+
+    def _free_domain(self) -> int:
+        """Return a domain that no other tests use; the claim is a Unix socket's name."""
+        for domain in random.SystemRandom().sample(DOMAINS, len(DOMAINS)):
+            claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            try:
+                claim.bind(f"\0rlservo-test-ros-{domain}")
+            except OSError:
+                claim.close()
+            else:
+                self._cleanup.callback(claim.close)
+                return domain
+        raise AssertionError("no ROS domain is free")
 
     # -- the bystander
 
@@ -157,11 +174,19 @@ class Ros:
 
     def drive_to(self, *target: float, frame: str = "base_link") -> dict[str, str]:
         """Return the heartbeat after a target has been driven to."""
-        episodes = int(self.heartbeat()["episodes"])
-        self.give_target(*target, frame=frame)
-        self.wait_until(
-            lambda: int((beat := self.heartbeat())["episodes"]) > episodes and beat["state"] not in ("running", "hold")
-        )
+        episodes, given = int(self.heartbeat()["episodes"]), 0.0
+
+        def is_taken() -> bool:
+            nonlocal given
+            if int(self.heartbeat()["episodes"]) > episodes:
+                return True
+            if time.monotonic() > given + REPEAT_S:  # a node that is new may not have discovered the publisher yet
+                given = time.monotonic()
+                self.give_target(*target, frame=frame)
+            return False
+
+        self.wait_until(is_taken)
+        self.wait_until(lambda: self.heartbeat()["state"] not in ("running", "hold"))
         return self.heartbeat()
 
     # -- a robot

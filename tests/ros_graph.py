@@ -82,12 +82,12 @@ def main() -> None:
         kind = interface("std_srvs/srv/Trigger")
         client = node.create_client(kind, service)
         assert client.wait_for_service(60.0), f"no service {service}"
-        future = client.call_async(kind.Request())
+        sent_s, future = time.time(), client.call_async(kind.Request())
         limit = time.monotonic() + 60.0
         while not future.done():
             assert time.monotonic() < limit, f"service {service} does not answer"
             time.sleep(0.01)
-        return to_plain(future.result())
+        return {"sent_s": sent_s, **to_plain(future.result())}
 
     def since(topic: str, time_s: float, count: int = KEPT) -> Any:
         return [(at, to_plain(one)) for at, one in messages[topic][-count:] if at >= time_s]

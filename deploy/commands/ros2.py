@@ -19,7 +19,7 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra, require
 
 if TYPE_CHECKING:
-    from rlservo.envs.ros2.link import Link
+    from rlservo.envs.ros2.link import Topics
 
 
 def ros2(
@@ -132,7 +132,7 @@ def ros2_sim(
             if robot == "mir100":
                 from rlservo.envs.ros2.simulated_base import SimulatedBase
 
-                links: list[Link] = []
+                links: list[Topics] = []
                 if ros:
                     from rlservo.envs.ros2.rclpy_link import RclpyLink
 

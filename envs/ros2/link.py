@@ -29,8 +29,8 @@ class Endpoint(NamedTuple):
     type: str  # "geometry_msgs/msg/Twist"
 
 
-class Link(Protocol):
-    """A connection to the graph. Callbacks come in a thread of its own, one at a time."""
+class Topics(Protocol):
+    """A place for messages. Callbacks come in a thread of its own, one at a time."""
 
     def now_s(self) -> float:
         """Return ROS's time [s]."""
@@ -44,6 +44,14 @@ class Link(Protocol):
         """Return a function that publishes a message, given as a dictionary."""
         ...
 
+    def close(self) -> None:
+        """Leave the graph."""
+        ...
+
+
+class Link(Topics, Protocol):
+    """A connection to the graph, which knows its other nodes."""
+
     def publishers(self, topic: str) -> list[Endpoint]:
         """Return the publishers of other nodes."""
         ...
@@ -54,10 +62,6 @@ class Link(Protocol):
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         """Return the subscribers of other nodes."""
-        ...
-
-    def close(self) -> None:
-        """Leave the graph."""
         ...
 
 

@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
 from rlservo.envs.robots.arm import RobotError
-from rlservo.envs.ros2.link import Endpoint, Publish
+from rlservo.envs.ros2.link import Publish
 from rlservo.envs.ros2.messages import parse
 
 LARGEST_MESSAGE = 1024 * 1024
@@ -113,20 +113,6 @@ class RosbridgeServer:
                     client.send(topic, text)
 
         return publish
-
-    def publishers(self, topic: str) -> list[Endpoint]:
-        """Return the bridge, for clients that publish."""
-        with self._lock:
-            is_published = any(topic in client.advertised for client in self._clients)
-        return [Endpoint(BRIDGE, self._types.get(topic, ""))] if is_published else []
-
-    rivals = publishers
-
-    def subscribers(self, topic: str) -> list[Endpoint]:
-        """Return the bridge, for clients that subscribe."""
-        with self._lock:
-            is_read = any(topic in client.subscribed for client in self._clients)
-        return [Endpoint(BRIDGE, self._types.get(topic, ""))] if is_read else []
 
     def close(self) -> None:
         """Close all connections and the port."""

@@ -19,14 +19,16 @@ from rlservo.envs.mir100.parameters import (
 )
 from rlservo.envs.mir100.simulation import Mir100Simulation
 from rlservo.envs.ros2.address import BASE_OPTIONS
-from rlservo.envs.ros2.link import Link
+from rlservo.envs.ros2.link import Topics
 from rlservo.envs.ros2.messages import (
     LASER_SCAN,
     ODOMETRY,
     TWIST,
     TWIST_STAMPED,
+    parse,
     quaternion,
     scan_message,
+    scan_points,
     scanner_pose,
     stamp,
     stamp_of,
@@ -50,7 +52,7 @@ log = logging.getLogger("rlservo.robot")
 class SimulatedBase:
     """The base, its drive with a time-out and limits, and its scanners."""
 
-    def __init__(self, links: Sequence[Link], *, world: str, is_stamped: bool, faults: LinkFaults) -> None:
+    def __init__(self, links: Sequence[Topics], *, world: str, is_stamped: bool, faults: LinkFaults) -> None:
         """Offer the topics on all links. Raises ValueError for a world that does not exist."""
         self.simulation = Mir100Simulation(world)
         self.simulation.place(STARTS.get(world, (0.0, 0.0, 0.0)))
@@ -130,10 +132,7 @@ class SimulatedBase:
         for name, scanner, ranges in (("front", FRONT_SCANNER, front), ("back", BACK_SCANNER, back)):
             message = scan_message(ranges, -Scanner.HALF_ANGLE, step, f"{name}_laser_link", now_s)
             self._publish[f"{name}_scan"](message)
-            hit = (ranges >= message["range_min"]) & (ranges < LASER_MAX)
-            x, y, yaw = scanner_pose(scanner)
-            angles = np.flatnonzero(hit) * step - Scanner.HALF_ANGLE + yaw
-            points.append(np.stack([x + ranges[hit] * np.cos(angles), y + ranges[hit] * np.sin(angles)], axis=1))
+            points.append(scan_points(parse(message), scanner_pose(scanner)))
         merged = np.concatenate(points)
         width = 2.0 * math.pi / MERGED_BEAMS
         beams = np.rint(np.arctan2(merged[:, 1], merged[:, 0]) / width).astype(int) + MERGED_BEAMS // 2

@@ -25,7 +25,7 @@ from stores import load_store
 
 JOINTS = ("shoulder", "elbow", "wrist")
 COMMANDS, REST = "/forward_command_controller/commands", "/rest"
-MAX_AGE_S = 0.6
+MAX_AGE_S = 1.0
 
 
 def mapping(path: Path) -> Path:
@@ -98,6 +98,7 @@ def test_node_waits_for_every_input_and_a_start_then_acts_on_ordered_joints(
     assert actions_since(ros, 0.0) == []
 
     until_state(ros, "running", lambda: send(ros, scrambled))
+    ros.wait_until(lambda: (send(ros, scrambled), actions_since(ros, 0.0))[1] != [])
     with Policy.load(bundle) as policy:
         observation = np.array([0.3, -0.2, np.degrees(0.1), *[0.5] * 24], np.float32)
         assert actions_since(ros, 0.0)[-1] == pytest.approx(policy.act(observation).tolist(), abs=1e-6)

@@ -78,9 +78,8 @@ def test_policy_reaches_its_targets_through_topics(ros: Ros, sim: Process, node:
     assert ros.heartbeat()["state"] == "arrived"  # the first node goes on
 
     get_moving(ros, 1.0)
-    began_s = time.time()
-    ros.ask("call", service="/rlservo/hold")
-    assert ros.moved_for(began_s) < 0.4 + BRAKING_S
+    held = ros.ask("call", service="/rlservo/hold")
+    assert ros.moved_for(held["sent_s"]) < 0.4 + BRAKING_S
     ros.wait_until(lambda: ros.heartbeat()["state"] == "holding")
     ros.ask("call", service="/rlservo/start")
     ros.wait_until(lambda: ros.speed() > FAST / 2)
