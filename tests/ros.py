@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import os
@@ -16,6 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.server.settings import ServerSettings
+from stores import load_store
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON = ROOT / ".ros" / "bin" / "python"
@@ -95,6 +100,19 @@ class Process:
             with contextlib.suppress(OSError):
                 stream.close()
         self._selector.close()
+
+
+class SlowServer:
+    """An application whose answers take `delay_s`."""
+
+    def __init__(self, folder: Path) -> None:
+        store = load_store(folder)
+        self._app, self.delay_s = create_app(lambda: store, ServerSettings()), 0.0
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] == "http":
+            await asyncio.sleep(self.delay_s)
+        await self._app(scope, receive, send)
 
 
 class Ros:

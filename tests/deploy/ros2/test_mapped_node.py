@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import subprocess
 import sys
@@ -16,12 +15,9 @@ import pytest
 
 from bundles import write_box_policy
 from environments import environment_with
-from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.settings import ServerSettings
-from ros import PYTHON, Process, Ros
+from ros import PYTHON, Process, Ros, SlowServer
 from servers import free_ports, over_uvicorn
-from stores import load_store
 
 JOINTS = ("shoulder", "elbow", "wrist")
 COMMANDS, REST = "/forward_command_controller/commands", "/rest"
@@ -73,19 +69,6 @@ def actions_since(ros: Ros, time_s: float) -> list[list[float]]:
 
 def until_state(ros: Ros, text: str, meanwhile: Any = lambda: None, node: str = "rlservo") -> None:
     ros.wait_until(lambda: (meanwhile(), text in ros.heartbeat(node)["message"])[1])
-
-
-class SlowServer:
-    """An application whose answers take `delay_s`."""
-
-    def __init__(self, folder: Path) -> None:
-        store = load_store(folder)
-        self._app, self.delay_s = create_app(lambda: store, ServerSettings()), 0.0
-
-    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
-        if scope["type"] == "http":
-            await asyncio.sleep(self.delay_s)
-        await self._app(scope, receive, send)
 
 
 def test_node_waits_for_every_input_and_a_start_then_acts_on_ordered_joints(

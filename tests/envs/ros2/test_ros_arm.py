@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ros import Process, Ros
+from ros import STANDS, Process, Ros, SlowServer
+from servers import over_uvicorn
 
 TARGETS = int(os.environ.get("RLSERVO_ROS_TARGETS", "3"))
 PREFIX = "left_"
@@ -41,9 +42,10 @@ def node(ros: Ros, sim: Process, all_shipped: Path) -> Iterator[Process]:
         node.close()
 
 
-def start_node(ros: Ros, all_shipped: Path, *options: object) -> Process:
+def start_node(ros: Ros, all_shipped: Path, *options: object, url: str = "") -> Process:
+    source = ("--url", url) if url else ("--bundle", all_shipped / "ur_positioning")
     return ros.rlservo(
-        "ros2", "--bundle", all_shipped / "ur_positioning", "--robot", f"ros2:prefix={PREFIX}",
+        "ros2", *source, "--robot", f"ros2:prefix={PREFIX}",
         "--env-arg", "ur_model=ur5", "--env-arg", "max_velocity_scale_factor=0.3", "--unproven", "--autostart",
         *options,
     )  # fmt: skip
@@ -154,6 +156,24 @@ def test_stopped_robot_does_not_move_again_before_a_new_target(ros: Ros, sim: Pr
     ros.wait_until(lambda: (sim.type("unlock"), ros.ask("call", service=RESEND)["success"])[1])
     assert not [line for line in node.lines[seen:] if "ready" in line]
     get_moving(ros, 1.0)
+
+
+def test_slow_server_holds_the_arm_instead_of_moving_it_late(
+    ros: Ros, sim: Process, all_shipped: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "ur_positioning").symlink_to(all_shipped / "ur_positioning")
+    app = SlowServer(tmp_path)
+    with over_uvicorn(app) as port:
+        node = start_node(ros, all_shipped, url=f"http://127.0.0.1:{port}")
+        node.wait_for("check -> ready")
+        get_moving(ros, 1.0)
+        began_s, app.delay_s = time.time(), 0.6
+        assert ros.moved_for(began_s) < 0.35 + BRAKING_S  # a cycle, and 2.5 of silence
+        ros.wait_until(lambda: ros.heartbeat()["state"] == "hold")
+        assert ros.speed() < STANDS
+        app.delay_s = 0.0
+        ros.wait_until(lambda: ros.speed() > FAST / 2)  # to the same target
+        assert node.end() == 0
 
 
 def test_latency_of_the_arm_is_measured_through_topics(ros: Ros, sim: Process) -> None:
