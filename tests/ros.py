@@ -65,6 +65,11 @@ class Process:
             goes_on = self.read(0.5)
             assert goes_on or any(text in line for line in self.lines[after:]), "\n".join(self.lines)
 
+    def read_all(self) -> None:
+        """Read what has been printed so far."""
+        while self._selector.get_map() and self._selector.select(0.0) and self.read(0.0):
+            pass
+
     def type(self, line: str) -> None:
         """Write a line to its standard input."""
         assert self.process.stdin is not None
@@ -84,8 +89,7 @@ class Process:
         while self.process.poll() is None:
             assert time.monotonic() < limit, "\n".join(["it does not end:", *self.lines])
             self.read(0.2)
-        while self.read(0.0) and self._selector.select(0.0):
-            pass
+        self.read_all()
         return self.process.returncode
 
     def close(self) -> None:
@@ -121,6 +125,7 @@ class Ros:
     def __init__(self) -> None:
         self._cleanup = contextlib.ExitStack()
         self.environment = {"ROS_DOMAIN_ID": str(self._free_domain()), "ROS_LOCALHOST_ONLY": "1"}
+        self._processes: list[Process] = []
         self._graph: Process | None = None
         self._states = ""
 
@@ -131,11 +136,17 @@ class Ros:
     def python(self, *words: str) -> Process:
         """Start a Python that has rclpy."""
         process = Process(list(words), self.environment)
+        self._processes.append(process)
         self._cleanup.callback(process.close)
         return process
 
     def close(self) -> None:
         self._cleanup.close()
+
+    def _last_lines(self) -> Iterator[str]:
+        for one in self._processes:
+            one.read_all()
+            yield from ("--", *one.lines[-12:])
 
     def _free_domain(self) -> int:
         """Return a domain that no other tests use; the claim is a Unix socket's name."""
@@ -166,7 +177,7 @@ class Ros:
     def wait_until(self, condition: Callable[[], bool]) -> None:
         limit = time.monotonic() + PATIENCE_S
         while not condition():
-            assert time.monotonic() < limit, "the condition never came true"
+            assert time.monotonic() < limit, "\n".join(["the condition never came true:", *self._last_lines()])
             time.sleep(0.1)
 
     # -- a node of rlservo's
