@@ -31,7 +31,8 @@ PATH_STEP = 0.05  # [rad], between two poses of a way that are looked at
 SETTLE_S = 0.2
 
 
-class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):
+# `stopped_by` has one type in both bases.
+class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[reportIncompatibleVariableOverride]
     """The scene of an arm that is a real one. What `connect` returns is closed by `close`."""
 
     def __init__(

@@ -22,7 +22,8 @@ from rlservo.envs.ros2.base import AGE_BOUND_S, BaseLimits, BaseState, RosBase
 Vector = NDArray[np.float64]
 
 
-class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):
+# `stopped_by` has one type in both bases.
+class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):  # pyright: ignore[reportIncompatibleVariableOverride]
     """The scene of a base that is a real one; `close` stops it."""
 
     _is_connected = False  # `place` is called by the simulation's constructor
