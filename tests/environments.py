@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import compileall
 import functools
 import os
 import re
@@ -11,7 +12,7 @@ import sys
 import tempfile
 import venv
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -27,6 +28,7 @@ ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")
 # pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
 CLIENT = ("httpcore>=1.0.6", "pydantic>=2.10")
 INSTALLED_S = 500
+UNPACKED = "unpacked"  # beside the wheel
 
 
 @pytest.fixture(scope="session")
@@ -44,8 +46,11 @@ def wheel() -> Path:
             done = subprocess.run(command, capture_output=True, text=True, timeout=300)
             assert done.returncode == 0, done.stdout + done.stderr
             assert "WARNING" not in done.stdout + done.stderr  # setuptools' are pages long
+            with zipfile.ZipFile(next(folder.glob("*.whl"))) as archive:
+                archive.extractall(folder / UNPACKED)
+            assert compileall.compile_dir(folder / UNPACKED, quiet=1)
 
-    made_of = [ROOT / name for name in PACKAGED]
+    made_of = [*(ROOT / name for name in PACKAGED), UNPACKED]
     return next(cached("wheel", [*made_of, versions("build")], build).glob("*.whl"))
 
 
@@ -58,25 +63,42 @@ def image_environment(wheel: Path, tmp_path: Path) -> Path:
 def environment_with(wheel: Path, folder: Path, *extras: str) -> Path:
     """Make a virtual environment of the wheel and what these extras require, nothing else.
 
-    Linked to the packages that are installed here, file by file, so that it costs no download. Made again each time, in
-    a second: one that is kept may outlive the packages that it links to.
+    Linked to the packages that are installed here, so that it costs no download, and to what Python has compiled of
+    them, which takes longer than most of what is run. Made again each time, in a second: one that is kept may outlive
+    the packages that it links to.
     """
     venv.create(folder)
     site = folder / "lib" / PYTHON / "site-packages"
-    with zipfile.ZipFile(next(wheel.parent.glob("*.whl"))) as archive:
-        archive.extractall(site)
     for distribution in _required("rlservo", set(extras)):
-        own = distribution.name == "rlservo"  # its files are the wheel's
-        for file in () if own else distribution.files or ():
-            if ".." not in file.parts and "__pycache__" not in file.parts and not (site / file).exists():
-                (site / file).parent.mkdir(parents=True, exist_ok=True)
-                (site / file).symlink_to(distribution.locate_file(file).absolute())
+        if distribution.name == "rlservo":  # its files are the wheel's
+            tree = wheel.parent / UNPACKED
+            _link(tree, site, [file.relative_to(tree) for file in tree.rglob("*") if file.is_file()])
+        else:
+            files = [Path(file) for file in distribution.files or () if ".." not in file.parts]
+            tops = {file.parts[0] for file in files if file.parts[1:] == ("__init__.py",)}
+            packages = {top for top in tops if not (site / top).exists()}  # some share one
+            root = Path(str(distribution.locate_file("."))).absolute()
+            for package in packages:
+                (site / package).symlink_to(root / package)
+            _link(root, site, [file for file in files if file.parts[0] not in packages])
         for point in distribution.entry_points.select(group="console_scripts"):
             script = folder / "bin" / point.name
             program = f"import sys\nfrom {point.module} import {point.attr}\nsys.exit({point.attr}())\n"
             script.write_text(f"#!{folder / 'bin' / 'python'}\n{program}")
             script.chmod(0o755)
     return folder
+
+
+def _link(root: Path, site: Path, files: Iterable[Path]) -> None:
+    """Link files, and the folders where Python keeps what it has compiled of them."""
+    for file in files:
+        if "__pycache__" in file.parts or (site / file).exists():
+            continue
+        (site / file).parent.mkdir(parents=True, exist_ok=True)
+        (site / file).symlink_to(root / file)
+        compiled = file.parent / "__pycache__"
+        if (root / compiled).is_dir() and not (site / compiled).exists():
+            (site / compiled).symlink_to(root / compiled)
 
 
 @functools.cache

@@ -55,10 +55,14 @@ NEEDS: dict[str, tuple[str, ...]] = {
 }
 EXTRAS = sorted(set(metadata.metadata("rlservo").get_all("Provides-Extra") or ()) - {"dev", "all"})
 
-# Each command in a process forked from one that has imported the command line: a tenth of the time of a start.
+# Each command in a process forked from one that has imported the command line, and what is installed of the packages
+# that take long: a tenth of the time of a start.
 PROGRAM = """
-import json, os, sys, tempfile
+import contextlib, importlib, json, os, sys, tempfile
 from rlservo.deploy import cli
+for slow in ("onnxruntime", "gymnasium", "torch", "mujoco"):
+    with contextlib.suppress(ImportError):
+        importlib.import_module(slow)
 ends = []
 for words in json.load(sys.stdin):
     with tempfile.TemporaryFile("w+") as out:
