@@ -75,6 +75,7 @@ class Server:
 def started(folder: Path, runtime: Path) -> Iterator[Server]:
     (port,) = free_ports(1)
     command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(folder), "--workers", str(WORKERS)]
+    runtime.mkdir(exist_ok=True)
     with running([*command, "--port", str(port)], port, XDG_RUNTIME_DIR=str(runtime)) as run:
         assert run.process.stdout is not None
         threading.Thread(target=list, args=(run.process.stdout,), daemon=True).start()  # so that the pipe never fills
@@ -83,16 +84,32 @@ def started(folder: Path, runtime: Path) -> Iterator[Server]:
         yield Server(run, key_file)
 
 
-@pytest.fixture
-def server(box_policy: Callable[..., Path], tmp_path: Path) -> Iterator[Server]:
+@pytest.fixture(scope="module")
+def versions(box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("policies")
     for version, scale in (("1", 1.0), ("2", 1.0), ("3", 400.0)):
-        box_policy(tmp_path / "policies", version=version, action_scale=scale)
-    (tmp_path / "runtime").mkdir()
-    with started(tmp_path / "policies", tmp_path / "runtime") as server:
-        with server.admin() as admin:
-            plan = admin.alias("ur5", "production", "1")["generation"]
-        server.wait_until_all_follow(plan)
+        box_policy(folder, version=version, action_scale=scale)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shared(versions: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    with started(versions, tmp_path_factory.mktemp("runtime")) as server:
         yield server
+
+
+@pytest.fixture
+def server(shared: Server) -> Server:
+    """A server whose production is version 1, without a canary."""
+    return at_version_1(shared)
+
+
+def at_version_1(server: Server) -> Server:
+    with server.admin() as admin:
+        admin.canary("ur5", None)
+        plan = admin.alias("ur5", "production", "1")["generation"]
+    server.wait_until_all_follow(plan)
+    return server
 
 
 @dataclass
@@ -216,9 +233,12 @@ def test_a_worker_that_dies_meanwhile_costs_no_promotion(server: Server, tmp_pat
     assert server.serves("2", None) and load.versions["2"] > 30
 
 
-def test_a_server_that_ends_leaves_it_unfinished_and_it_says_how_to_go_on(server: Server, tmp_path: Path) -> None:
+def test_a_server_that_ends_leaves_it_unfinished_and_it_says_how_to_go_on(versions: Path, tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
-    with promoting(server, log, "2", "--for", "2s") as process:
+    with (
+        started(versions, tmp_path / "runtime") as server,
+        promoting(at_version_1(server), log, "2", "--for", "2s") as process,
+    ):
         wait_for_checks(process, log, 1)
         server.run.process.send_signal(signal.SIGTERM)
         code, said = outcome_of(process)
