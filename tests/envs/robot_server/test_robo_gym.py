@@ -33,11 +33,16 @@ Drive = Callable[..., list[dict[str, Any]]]
 
 @pytest.fixture
 def drive(robo_gym_python: Path, tmp_path: Path) -> Drive:
-    """Run jobs in robo-gym's environment and return their results; `at_pause` is called where a job pauses."""
+    """Run jobs in robo-gym's environment and return their results; `at_pause` is called where a job pauses.
+
+    Jobs that follow each other with the same arguments are episodes of one simulator, which takes a second to start.
+    """
 
     def run(jobs: list[dict[str, Any]], at_pause: Callable[[], None] | None = None) -> list[dict[str, Any]]:
         asked, answered = tmp_path / "jobs.json", tmp_path / "results.json"
-        asked.write_text(json.dumps(jobs))
+        made_with = [(job["env"], job["arguments"]) for job in jobs]
+        keeps = [made == following for made, following in zip(made_with, [*made_with[1:], None], strict=True)]
+        asked.write_text(json.dumps([{**job, "keep": keep} for job, keep in zip(jobs, keeps, strict=True)]))
         line = [str(robo_gym_python), str(DRIVER), str(asked), str(answered)]
         with subprocess.Popen(
             line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -121,9 +126,8 @@ def test_positioning_episodes_are_ours_for_every_arm(drive: Drive, manager: Serv
             "arguments": sim_arguments(manager, ur_model=ur_model),
             "reset": {"options": options},
             "actions": actions,
-            "keep": number < len(episodes),
         }
-        for number, (options, actions) in enumerate(episodes, 1)
+        for options, actions in episodes
     ]
     results = drive(jobs)
     for (options, actions), theirs in zip(episodes, results, strict=True):
