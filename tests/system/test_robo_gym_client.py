@@ -111,10 +111,11 @@ def run_each(
 @pytest.mark.parametrize(
     ("task", "episodes", "expected"),
     [
-        ("EndEffectorPositioningUR", 30, 27),
-        ("NoObstacleNavigationMir100", 20, 18),
-        # 93.8 % over 500 episodes: fewer than 13 of 20 come once in seventy thousand times.
-        ("ObstacleAvoidanceMir100", 20, 13),
+        # Cards: 500 of 500. At 98 % fewer would come once in four hundred thousand times.
+        ("EndEffectorPositioningUR", 20, 15),
+        ("NoObstacleNavigationMir100", 12, 8),
+        # 93.8 % over 500 episodes: fewer than 7 of 12 come once in 26,000 times.
+        ("ObstacleAvoidanceMir100", 12, 7),
     ],
 )
 def test_served_policies_arrive_in_robo_gyms_environments(
@@ -347,14 +348,14 @@ def test_policy_that_ships_needs_the_frame_of_the_documents_commands(
             URSettings(rs_mode="1object", reference_frame=frame, action_cycle_rate=10.0, max_velocity_scale_factor=0.1)
         )
         try:
-            more = ("--url", url, "--rs-address", f"127.0.0.1:{robot.port}", "--episodes", "20", "--json")
+            more = ("--url", url, "--rs-address", f"127.0.0.1:{robot.port}", "--episodes", "12", "--json")
             done = run(robo_gym_python, light_client, *more)
         finally:
             robot.stop()
         assert done.returncode == 0, done.stderr
         successes[frame] = json.loads(done.stdout)["successes"]
-    assert successes["base_link"] >= 15
-    assert successes["base"] <= 8
+    assert successes["base_link"] >= 8
+    assert successes["base"] <= 5
 
 
 def test_the_cockpit_shows_the_robot_that_robo_gyms_environment_drives(
