@@ -24,3 +24,14 @@ def test_latency_is_the_links_and_the_followers_and_gives_the_evaluation_to_pass
     assert report.disturbance == f"latency={report.cycles},noise=real"
     assert report.state_period_ms >= 7.9
     assert abs(arm.controller.simulation.joint_positions[5]) < 0.02
+
+
+def test_motion_that_was_cut_short_is_followed_by_a_whole_one(arm: RunningArm) -> None:
+    """A busy computer stops commanding before the wrist has turned: the way back would be no motion at all."""
+    real = RtdeArm(arm.host, "ur5", setpoint_timeout_s=0.5, limits=Limits(watchdog_hz=1.0))
+    home = real.arm_state().positions.copy()
+    try:
+        report = measure_latency(real, steps=2, on_step=lambda _: real.go_to(home))
+    finally:
+        real.close()
+    assert report.steps == 2
