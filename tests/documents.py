@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import os
+import pty
 import re
 import signal
-import socket
 import subprocess
 import sys
 import textwrap
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
 import typer
 
 from rlservo.deploy.cli import app
@@ -25,9 +26,15 @@ ROOT = Path(__file__).resolve().parents[1]
 BLOCK = re.compile(
     r"^(<!-- not run: [^\n]+ -->\n)?( *)(?:<!-- not run: ([^\n]+) -->\n *)?```(\w+)\n(.*?)^ *```$", re.M | re.S
 )
-STAYS = re.compile(r"^(\w+=\S+ )*rlservo (serve|cockpit|server-manager|robot-server)\b")  # until Ctrl-C
+STAYS = re.compile(  # until Ctrl-C
+    r"^(?:\w+=\S+ )*rlservo "
+    r"(serve|cockpit|server-manager|robot-server|ur-controller|ros2-sim|ros2|learn|policy promote)\b(?!.*&\s*$)"
+)
+BEGUN = {"learn": "is the checkpoint itself", "policy promote": "watching version", "ros2": " -> stopped"}
+"""What such a command prints when it has begun; the others invite to press Ctrl-C."""
+QUESTION = "[y/N] "
 NOT_HERE = re.compile(r"^(pip install|make) ")  # tests/test_wheel.py installs, tests/system/test_demo.py makes
-PORTS = ("8000", "8080", "8090", "6379")
+PORTS = ("8000", "8080", "8090", "6379", "9090", "50051")
 PATIENCE_S = 300.0
 
 
@@ -84,52 +91,92 @@ class Shell:
     """A folder that looks like the checkout, in which the blocks of a page run."""
 
     folder: Path
+    network: tuple[str, ...] = ()
+    """The words that run a command in another network (`other_network`)."""
     ports: dict[str, str] = field(
         default_factory=lambda: dict(zip(PORTS, map(str, free_ports(len(PORTS))), strict=True))
     )
-    groups: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    terminals: dict[subprocess.Popen[bytes], int] = field(default_factory=dict)
+    """The keyboard of each process that was started."""
+    staying: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    """Commands that run until Ctrl-C, each in a terminal of its own: one of a kind."""
 
     def run(self, block: Block) -> str:
-        """Run a block to its end, or until the server that its last line starts answers; return its output."""
+        """Run a block; return its output. Its last command may stay: it is waited for until it has begun."""
         if block.language == "python":
             (self.folder / "block.py").write_text(self._with_ports(block.text))
             return self._finish("python block.py")
-        lines = [line for line in block.text.splitlines(keepends=True) if not NOT_HERE.match(line)]
-        if not lines or not STAYS.match(lines[-1]):
-            return self._finish("".join(lines))
-        self.stop()
-        out = self._finish("".join(lines[:-1]))  # what it leaves running, a Redis say, runs beside the server
-        port = self.ports["8090" if "cockpit" in lines[-1] else "8000"]
-        server = self._start(f"exec env {lines[-1].split('#')[0].strip()} --port {port}", "server")
-        deadline = time.monotonic() + PATIENCE_S
-        while True:
-            with suppress(OSError), socket.create_connection(("127.0.0.1", int(port)), timeout=1.0):
-                return out
-            assert server.poll() is None, (self.folder / "server").read_text()
-            assert time.monotonic() < deadline, lines[-1]
-            time.sleep(0.2)
+        lines = re.sub(r" *\\\n *", " ", block.text).splitlines(keepends=True)
+        stays = STAYS.match(lines[-1]) if lines else None
+        done = lines[:-1] if stays else lines
+        assert not any(map(STAYS.match, done)), f"pasted, the first command keeps the terminal:\n{block.text}"
+        out = self._finish("".join(line for line in done if not NOT_HERE.match(line)))
+        if stays:
+            self._stay(stays[1], lines[-1].partition(" #")[0].strip())
+        return out
 
     def stop(self) -> None:
         """End what the blocks have started and left running."""
-        for started in self.groups:
+        with ExitStack() as ends:  # of all, even if one does not end as it should
+            for started in self.terminals:
+                ends.callback(self._end, started)
+            self._press_ctrl_c(*self.staying)
+
+    def _stay(self, kind: str, line: str) -> None:
+        if kind in self.staying:
+            kinds = list(self.staying)
+            self._press_ctrl_c(*kinds[kinds.index(kind) :])
+        if kind in ("serve", "cockpit"):
+            line += f" --port {self.ports['8000' if kind == 'serve' else '8090']}"
+        started = self.staying[kind] = self._start(f"exec env {line}", kind)
+        deadline = time.monotonic() + PATIENCE_S
+        while BEGUN.get(kind, "Ctrl-C") not in (printed := self._printed(kind)):
+            assert started.poll() is None, printed
+            assert time.monotonic() < deadline, f"{line} has not begun:\n{printed}"
+            time.sleep(0.1)
+
+    def _press_ctrl_c(self, *kinds: str) -> None:
+        for kind in reversed(kinds):  # a server or robot goes after what uses it
+            started = self.staying.pop(kind)
+            assert started.poll() is None, self._printed(kind)
+            os.killpg(started.pid, signal.SIGINT)
+            code = self._wait(started)
+            assert code in (0, 130), f"{kind} ended with {code}:\n{self._printed(kind)}"
+
+    def _end(self, started: subprocess.Popen[bytes]) -> None:
+        if started in self.terminals:
             with suppress(ProcessLookupError):
                 os.killpg(started.pid, signal.SIGTERM)
-            try:
-                started.wait(60)
-            except subprocess.TimeoutExpired:
-                os.killpg(started.pid, signal.SIGKILL)
-                started.wait()
-                raise
-        self.groups.clear()
+            self._wait(started)
+
+    def _wait(self, started: subprocess.Popen[bytes]) -> int:
+        try:
+            return started.wait(60)
+        except subprocess.TimeoutExpired:
+            os.killpg(started.pid, signal.SIGKILL)
+            started.wait()
+            raise
+        finally:
+            os.close(self.terminals.pop(started))
 
     def _finish(self, script: str) -> str:
+        """Run a script to its end, and answer what it asks."""
         if not script.strip():
             return ""
         started = self._start("set -e\n" + script, "output")
-        code = started.wait(PATIENCE_S)
-        output = (self.folder / "output").read_text()
-        assert code == 0, f"{script}\n{output}"
-        return output
+        deadline, answered = time.monotonic() + PATIENCE_S, 0
+        while started.poll() is None:
+            if self._printed("output").count(QUESTION) > answered:
+                answered += 1
+                os.write(self.terminals[started], b"y\n")
+            assert time.monotonic() < deadline, f"{script}\n{self._printed('output')}"
+            with suppress(subprocess.TimeoutExpired):
+                started.wait(0.1)
+        assert started.returncode == 0, f"{script}\n{self._printed('output')}"
+        return self._printed("output")
+
+    def _printed(self, name: str) -> str:
+        return (self.folder / f"{name}.txt").read_text(errors="replace")
 
     @property
     def runtime(self) -> Path:
@@ -138,33 +185,52 @@ class Shell:
 
     def _start(self, script: str, output: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {
-            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "PATH": f"{self.folder / 'bin'}:{Path(sys.executable).parent}:{os.environ['PATH']}",
             "HOME": str(self.folder),
             "XDG_RUNTIME_DIR": str(self.runtime),
             "RLSERVO_URL": f"http://127.0.0.1:{self.ports['8000']}",
         }
-        with (self.folder / output).open("wb") as file:
+        keyboard, terminal = pty.openpty()  # no bash: it would take it over, and hang up on what it leaves running
+        with (self.folder / f"{output}.txt").open("wb") as file:
             started = subprocess.Popen(
-                ["bash", "-c", self._with_ports(script)],
-                cwd=self.folder, env=environment, stdout=file, stderr=subprocess.STDOUT, start_new_session=True,
+                [*self.network, "sh", "-c", self._with_ports(script)],
+                cwd=self.folder, env=environment, stdin=terminal, stdout=file, stderr=subprocess.STDOUT,
+                start_new_session=True,
             )  # fmt: skip
-        self.groups.append(started)
+        os.close(terminal)
+        self.terminals[started] = keyboard
         return started
 
     def _with_ports(self, text: str) -> str:
         for printed, ours in self.ports.items():
-            text = re.sub(rf"(127\.0\.0\.1:|http\.server |--port ){printed}\b", rf"\g<1>{ours}", text)
+            text = re.sub(rf"(127\.0\.0\.1:|http\.server |port ){printed}\b", rf"\g<1>{ours}", text)
         return text
 
 
 @contextmanager
-def shell(folder: Path) -> Iterator[Shell]:
+def shell(folder: Path, network: tuple[str, ...] = ()) -> Iterator[Shell]:
     """Make a checkout's look-alike in a folder; what was started there is ended."""
     for name in ("examples", "deploy"):
         (folder / name).symlink_to(ROOT / name)
-    opened = Shell(folder)
+    opened = Shell(folder, network)
     opened.runtime.mkdir()
     try:
         yield opened
     finally:
         opened.stop()
+
+
+@contextmanager
+def other_network(address: str) -> Iterator[tuple[str, ...]]:
+    """Make a network that has this address; give the words that run a command in it. Skips where none may be made."""
+    script = f"ip link set lo up && ip address add {address}/32 dev lo && echo up && exec cat"
+    command = ["unshare", "--net", "sh", "-c", script]
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, text=True, **pipes) as holder:
+        assert holder.stdin is not None and holder.stdout is not None
+        try:
+            if (line := holder.stdout.readline()) != "up\n":
+                pytest.skip(f"no network of its own can be made here: {line.strip()}")
+            yield ("nsenter", f"--net=/proc/{holder.pid}/ns/net")
+        finally:
+            holder.stdin.close()

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
 from bundles import SHIPPED
 from command_line import rlservo_here
-from documents import ROOT, blocks, commands, pages, shell, unknown_options
+from documents import ROOT, Block, blocks, commands, other_network, pages, shell, unknown_options
 from rlservo.deploy.demo.demo import ROBOTS
+from ros import PYTHON, Ros
+from trainings import Trained
 
 README = ROOT / "README.md"
 CARTPOLE = ROOT / "examples" / "checkpoints" / "cartpole_dqn"
 TUTORIAL = ROOT / "docs" / "tutorial" / "first-robot.md"
-# Their client is robo-gym's Python: tests/system/test_robo_gym_client.py runs them.
-WITH_ROBO_GYM = {"robo-gym.md", "real-arm.md"}
-GUIDES = [page for page in pages() if page not in (README, TUTORIAL) and page.name not in WITH_ROBO_GYM]
+HOW_TO = ROOT / "docs" / "how-to"
+# The client of the first two is robo-gym's Python: tests/system/test_robo_gym_client.py runs them. The others need more
+# than a folder with policies.
+ELSEWHERE = {"robo-gym", "real-arm", "export", "sources", "learn-online", "ur-arm", "ros2"}
+REAL_ARM = """
+rlservo ur-controller --model ur5e --host 192.168.0.2 > arm.txt 2>&1 &
+until grep -q Ctrl-C arm.txt; do sleep 0.2; done
+"""
+GUIDES = [page for page in pages() if page not in (README, TUTORIAL) and page.stem not in ELSEWHERE]
 
 
 def test_readme_and_demo_have_the_same_policies_under_the_same_names() -> None:
@@ -41,9 +52,10 @@ def test_readmes_policy_bears_readmes_disturbance(shipped: Path) -> None:
     assert json.loads(done.stdout)["successes"] >= 18, done
 
 
-def ran(page: Path, folder: Path) -> str:
-    """Run a page's blocks; return what they printed."""
-    with shell(folder) as opened:
+def ran(page: Path, folder: Path, network: tuple[str, ...] = (), *, before: str = "") -> str:
+    """Run a page's blocks after the commands that stand for what the reader has; return what they printed."""
+    with shell(folder, network) as opened:
+        opened.run(Block("sh", before))
         return "".join(
             opened.run(block) for block in blocks(page) if block.language in ("sh", "python") and not block.reason
         )
@@ -66,24 +78,77 @@ def test_tutorial_runs_as_printed(tmp_path: Path) -> None:
     assert re.search(r"^success$", printed, re.MULTILINE)
 
 
+@pytest.fixture
+def folder(shipped: Path, tmp_path: Path) -> Path:
+    """What every guide begins with: a folder with the policies of the README."""
+    for name in ("ur5", "mir100"):
+        shutil.copytree(shipped / name, tmp_path / "policies" / name)
+    return tmp_path
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", GUIDES, ids=lambda page: page.stem)
-def test_guide_runs_as_printed(page: Path, shipped: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_guide_runs_as_printed(page: Path, folder: Path, request: pytest.FixtureRequest) -> None:
     if not any(block.language in ("sh", "python") and not block.reason for block in blocks(page)):
-        pytest.skip("none of its blocks can run here; the next test checks them")
-    shutil.copytree(shipped / "ur5", tmp_path / "policies" / "ur5")
-    text = page.read_text(encoding="utf-8")
-    if "s3://bucket/" in text:
+        pytest.skip("none of its blocks can run here; the last test checks them")
+    if "s3://bucket/" in page.read_text(encoding="utf-8"):
         request.getfixturevalue("storage").make("bucket")
-    if "~/ray_results/PPO_2026" in text:  # HOME is this folder
-        trial = tmp_path / "ray_results" / "PPO_2026" / "trial"
-        shutil.copytree(CARTPOLE, trial / "checkpoint_000000")
-        iteration = json.loads((CARTPOLE / "rlservo_facts.json").read_text())["training_iterations"]
-        result = {"training_iteration": iteration, "env_runners": {"episode_return_mean": 450.0}}
-        (trial / "result.json").write_text(json.dumps(result))
-        shutil.copytree(CARTPOLE, tmp_path / "runs" / "mine" / "checkpoint_000010")
-        (tmp_path / "my_project").mkdir()
-    ran(page, tmp_path)
+    ran(page, folder)
+
+
+@pytest.mark.slow
+def test_guide_to_export_runs_as_printed(folder: Path) -> None:
+    trial = folder / "ray_results" / "PPO_2026" / "trial"  # HOME is this folder
+    shutil.copytree(CARTPOLE, trial / "checkpoint_000000")
+    iteration = json.loads((CARTPOLE / "rlservo_facts.json").read_text())["training_iterations"]
+    result = {"training_iteration": iteration, "env_runners": {"episode_return_mean": 450.0}}
+    (trial / "result.json").write_text(json.dumps(result))
+    shutil.copytree(CARTPOLE, folder / "runs" / "mine" / "checkpoint_000010")
+    (folder / "my_project").mkdir()
+    ran(HOW_TO / "export.md", folder)
+
+
+@pytest.mark.slow
+def test_guide_to_sources_runs_as_printed(folder: Path) -> None:
+    """On what Stable-Baselines3 leaves of normalized observations, and of stacked frames."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    vec_env = importlib.import_module("stable_baselines3.common.vec_env")
+    (folder / "logs").mkdir()
+    for model, statistics, frames in (("logs/best_model", "logs/vecnormalize.pkl", 1), ("arm", "stats.pkl", 4)):
+        env = vec_env.VecNormalize(vec_env.DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+        stacked = vec_env.VecFrameStack(env, frames) if frames > 1 else env
+        trained = sb3.PPO("MlpPolicy", stacked, n_steps=8, batch_size=8, n_epochs=1, device="cpu").learn(8)
+        trained.save(folder / model)
+        env.save(folder / statistics)
+    ran(HOW_TO / "sources.md", folder)
+
+
+@pytest.mark.slow
+def test_guide_to_online_learning_runs_as_printed(trained: Callable[[str], Trained], folder: Path) -> None:
+    (checkpoint,) = trained("ur").folder.glob("runs/PPO-*/*/checkpoint_*")
+    shutil.copytree(checkpoint, folder / "runs" / "ppo" / "checkpoint")
+    ran(HOW_TO / "learn-online.md", folder)
+
+
+@pytest.mark.slow
+def test_guide_to_a_real_arm_runs_as_printed(folder: Path) -> None:
+    """The arm at the page's address is simulated, in a network of its own."""
+    pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
+    with other_network("192.168.0.2") as network:
+        printed = ran(HOW_TO / "ur-arm.md", folder, network, before=REAL_ARM)
+    assert "The policy must pass:" in printed
+
+
+@pytest.mark.slow
+def test_guide_to_ros_runs_as_printed(ros: Ros, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`rlservo` is the one of the Python that has rclpy."""
+    for name, value in ros.environment.items():
+        monkeypatch.setenv(name, value)
+    command = folder / "bin" / "rlservo"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec {PYTHON} -m rlservo.deploy.cli "$@"\n')
+    command.chmod(0o755)
+    ran(HOW_TO / "ros2.md", folder)
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
