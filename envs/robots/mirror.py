@@ -1,6 +1,6 @@
-"""A real arm in the place of the simulated one: the environments see it through the scene's model.
+"""A real arm in place of the simulated one: the environments see it through the scene's model.
 
-The model stands where the arm was measured, so that tool, contacts and pictures are computed as in the simulator;
+The model follows the arm's measured positions, so that tool, contacts and pictures are computed as in the simulator;
 commands go to the arm, and a control cycle passes in real time. The state machine around the policy is here.
 """
 
@@ -25,10 +25,10 @@ from rlservo.envs.ur.simulation import URSimulation
 if TYPE_CHECKING:
     from rlservo.envs.robots.metrics import ArmMetrics
 
-AT_START = 0.03  # [rad], from which on the arm need not move
-PATH_STEP = 0.05  # [rad], between two poses of a way that are looked at
+AT_START = 0.03  # [rad], within which the arm need not move
+PATH_STEP = 0.05  # [rad], between two checked poses of a path
 SETTLE_S = 0.2
-FRESH_S = 6.0  # [s], for which a state that may be acted on is waited for; ur_rtde itself waits for 3 s
+FRESH_S = 6.0  # [s] to wait for a fresh state; ur_rtde itself waits for 3 s
 STALE_CYCLES = 2.0  # between an observation and the action for it
 LATE_CYCLES = 2.5  # between two setpoints
 
@@ -37,7 +37,7 @@ _PHASE_STATES = {Phase.LATE: (State.HOLD, "no setpoint came"), Phase.STALE: (Sta
 
 
 class MirroredSimulation(URSimulation):
-    """The scene of an arm that is a real one. What `connect` returns is closed by `close`."""
+    """The scene of a real arm. `close` also closes the object that `connect` returns."""
 
     def __init__(
         self,
@@ -50,9 +50,9 @@ class MirroredSimulation(URSimulation):
         metrics: str | None = None,
         **scene: Any,
     ) -> None:
-        """`connect` takes the time [s] after which the arm holds without a setpoint. Raises what it raises.
+        """Connect. `connect` takes the time [s] after which the arm holds without a setpoint; its errors are raised.
 
-        `metrics` is the address, HOST:PORT, at which Prometheus reads the arm's.
+        `metrics` is the address, HOST:PORT, at which Prometheus reads the arm's metrics.
         """
         super().__init__(ur_model, max_velocity_scale=max_velocity_scale, cycle_s=cycle_s, **scene)
         self.operator = operator
@@ -62,7 +62,7 @@ class MirroredSimulation(URSimulation):
         self._connect = connect
         self._due_s = 0.0
         self._counts: dict[str, int] = {}
-        self._lost: dict[str, int] = {}  # counts of connections that are closed
+        self._lost: dict[str, int] = {}  # counts of closed connections
         self._arm = self._connected()
         self.state_seen = self._arm.arm_state()
         self._metrics: ArmMetrics | None = None
@@ -81,9 +81,9 @@ class MirroredSimulation(URSimulation):
     # -- instead of the simulation's
 
     def place(self, joint_positions: ArrayLike) -> bool:
-        """Move the arm slowly to joint positions [rad] (6,), after asking; return whether it would collide there.
+        """Move the arm slowly to joint positions [rad] (6,), after confirmation; return whether it would collide there.
 
-        Raises InvalidResetError where something is in the way, RobotError for a robot that has stopped.
+        Raises InvalidResetError if something is in the way, RobotError if the robot has stopped.
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         if super().place(goal):
@@ -94,10 +94,10 @@ class MirroredSimulation(URSimulation):
         for share in np.linspace(0.0, 1.0, 2 + int(away / PATH_STEP)):
             if super().place(start + share * (goal - start)) and share > 0.0:
                 links = " and ".join(self.contacts()[0])
-                raise InvalidResetError(f"on the straight way to the start {links} would touch: move the arm by hand")
+                raise InvalidResetError(f"{links} would touch on the straight path to the start: move the arm by hand")
         if away > AT_START:
             speed = self._arm.limits.start_speed * self._arm.limits.speed_scale
-            self.operator.confirm(f"the robot moves to its start, {away:.2f} rad at {speed:.2g} rad/s")
+            self.operator.confirm(f"the robot will move to its start, {away:.2f} rad at {speed:.2g} rad/s")
             self.states.enter(State.GO_TO_START, f"{away:.2f} rad away")
             try:
                 self._arm.go_to(goal)
@@ -117,13 +117,13 @@ class MirroredSimulation(URSimulation):
         return self.in_collision
 
     def settle(self) -> None:
-        """Wait until the arm stands."""
+        """Wait until the arm is at rest."""
         self._arm.hold()
         time.sleep(SETTLE_S)
         self._mirror()
 
     def command(self, joint_positions: ArrayLike) -> None:
-        """Replace the setpoint, unless a person leads the arm or what was observed is too old to act on."""
+        """Replace the setpoint, unless a person leads the arm or the observation is too old to act on."""
         self.data.act[:] = self._arm.setpoint()
         super().command(joint_positions)
         age_s = time.monotonic() - self.state_seen.received_s + self.state_seen.age_s
@@ -143,11 +143,11 @@ class MirroredSimulation(URSimulation):
         self._arm.hold()
 
     def advance(self) -> None:
-        """Wait for the end of the control cycle and look at the arm."""
+        """Wait for the end of the control cycle and read the arm's state."""
         now = time.monotonic()
         self._due_s = max(self._due_s + self._cycle_s, now - self._cycle_s)
         if now - self._due_s > 0.0:
-            self._due_s = now  # a cycle that was missed is not caught up
+            self._due_s = now  # a missed cycle is not caught up
         time.sleep(max(0.0, self._due_s - now))
         self._mirror()
         self._follow_states()
@@ -157,7 +157,7 @@ class MirroredSimulation(URSimulation):
         return self._arm.arm_state()
 
     def robot_info(self) -> dict[str, Any] | None:
-        """Return the state, its changes and the limits that were kept, since the last call."""
+        """Return the state, its changes and the applied limits since the last call."""
         counts = self.limited()
         new = {name: count - self._counts.get(name, 0) for name, count in counts.items()}
         self._counts = counts
@@ -173,7 +173,7 @@ class MirroredSimulation(URSimulation):
         self.operator.toggle()
 
     def limited(self) -> dict[str, int]:
-        """Return how many cycles of the command stream each limit was kept in, by element, and stale actions."""
+        """Return the number of cycles in which each limit was applied, by element, and of stale actions."""
         counts = dict(self._lost)
         for name, count in self._arm.limited().items():
             counts[name] = counts.get(name, 0) + count
@@ -206,7 +206,7 @@ class MirroredSimulation(URSimulation):
         self._arm = self._connected()
 
     def _mirror(self) -> None:
-        """Put the model where the arm is; wait, standing, for a state that may be acted on."""
+        """Set the model to the arm's position; hold and wait until its state is fresh."""
         limit = time.monotonic() + FRESH_S
         state = self._arm.arm_state()
         while time.monotonic() - state.received_s + state.age_s > AGE_BOUND_S and not self._note_fault():
@@ -214,7 +214,7 @@ class MirroredSimulation(URSimulation):
                 self.stopped_by = "stale_observation"
                 self._arm.hold()
                 age_s = time.monotonic() - state.received_s + state.age_s
-                self.states.enter(State.FAULT, f"the robot's newest state is {age_s:.2f} s old, {FRESH_S:g} s long")
+                self.states.enter(State.FAULT, f"the robot's newest state is {age_s:.2f} s old, after {FRESH_S:g} s")
                 break
             time.sleep(0.002)
             state = self._arm.arm_state()
@@ -233,7 +233,7 @@ class MirroredSimulation(URSimulation):
         return bool(fault)
 
     def _follow_states(self) -> None:
-        """Follow the command stream's phase and the person at the terminal."""
+        """Follow the command stream's phase and the operator at the terminal."""
         if self._note_fault() or self.states.state == State.FAULT:
             return
         if self.operator.has_taken_over:

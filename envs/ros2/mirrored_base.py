@@ -1,6 +1,6 @@
-"""A real base in the place of the simulated MiR100: the environments see it through the scene's model.
+"""A real base in place of the simulated MiR100: the environments see it through the scene's model.
 
-The model stands where odometry has the base; commands go to the base, and a control cycle passes in real time.
+The model follows the base's odometry; commands go to the base, and a control cycle passes in real time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rlservo.envs.robots.operator_terminal import Operator
 from rlservo.envs.robots.states import State, StateMachine
 from rlservo.envs.ros2.base import AGE_BOUND_S, BaseLimits, RosBase
 
-FRESH_S = 6.0  # [s], for which a state that may be acted on is waited for
+FRESH_S = 6.0  # [s] to wait for a fresh state
 STALE_CYCLES, LATE_CYCLES = 2.0, 2.5  # between an observation and its action, and between two commands
 
 Vector = NDArray[np.float64]
@@ -29,7 +29,7 @@ _PHASE_STATES = {Phase.LATE: (State.HOLD, "no command came"), Phase.STALE: (Stat
 
 
 class MirroredMir100(Mir100Simulation):
-    """The scene of a base that is a real one; `close` stops it."""
+    """The scene of a real base; `close` stops it."""
 
     def __init__(self, robot: str, *, needs_scan: bool, limits: Mapping[str, Any], confirm: bool) -> None:
         """Connect and wait for every input. Raises RobotError."""
@@ -54,7 +54,7 @@ class MirroredMir100(Mir100Simulation):
     def place(
         self, pose: ArrayLike, *, target: ArrayLike | None = None, cubes: Sequence[ArrayLike] | Vector | None = None
     ) -> bool:
-        """Stand where the base stands, with a new target, after asking. Raises RobotError for a base that stopped."""
+        """Start at the base's position with a new target, after confirmation. Raises RobotError if the base stopped."""
         if not self._is_up:
             return super().place(pose, target=target, cubes=cubes)
         if self.states.state == State.FAULT or self._base.fault:
@@ -66,7 +66,7 @@ class MirroredMir100(Mir100Simulation):
         self._mirror()
         super().place(self.pose, target=target)
         x, y, _ = self.target
-        self._operator.confirm(f"the robot drives to {x:.2f}, {y:.2f} m in its odometry's frame")
+        self._operator.confirm(f"the robot will drive to {x:.2f}, {y:.2f} m in its odometry's frame")
         if self.states.state != State.HUMAN:
             self.states.enter(State.BLEND_IN)
             self._base.blend_in()
@@ -76,7 +76,7 @@ class MirroredMir100(Mir100Simulation):
         return False
 
     def command(self, linear: float, angular: float) -> bool:
-        """Replace the velocities [m/s], [rad/s]; return False where they are not acted on."""
+        """Replace the velocities [m/s], [rad/s]; return False if they are not used."""
         super().command(linear, angular)
         seen = self._seen
         age_s = time.monotonic() - seen.received_s + seen.age_s
@@ -91,20 +91,20 @@ class MirroredMir100(Mir100Simulation):
         return True
 
     def hold(self) -> None:
-        """Decelerate and stand."""
+        """Decelerate and hold."""
         self._base.hold()
 
     def advance(self, substeps: int = 0) -> None:  # noqa: ARG002
-        """Wait for the end of the control cycle and look at the base."""
+        """Wait for the end of the control cycle and read the base's state."""
         now = time.monotonic()
-        self._due_s = max(self._due_s + CYCLE_S, now)  # a cycle that was missed is not caught up
+        self._due_s = max(self._due_s + CYCLE_S, now)  # a missed cycle is not caught up
         time.sleep(self._due_s - now)
         self._mirror()
         self._follow_states()
 
     @property
     def scan(self) -> Vector:
-        """All readings [m], (1012,), computed from what the base's scans see."""
+        """All readings [m], (1012,), computed from the base's scans."""
         return self._readings
 
     @property
@@ -113,7 +113,7 @@ class MirroredMir100(Mir100Simulation):
         return False
 
     def robot_info(self) -> dict[str, Any] | None:
-        """Return the state, its changes and the limits that were kept, since the last call."""
+        """Return the state, its changes and the applied limits since the last call."""
         counts = self._total()
         new = {name: count - self._counts.get(name, 0) for name, count in counts.items()}
         self._counts = counts
@@ -125,7 +125,7 @@ class MirroredMir100(Mir100Simulation):
         return info
 
     def limited(self) -> dict[str, int] | None:
-        """Return in how many commands each limit was kept, and stale actions."""
+        """Return the number of commands in which each limit was applied, and of stale actions."""
         return self._total()
 
     def take_over(self) -> None:
@@ -154,14 +154,14 @@ class MirroredMir100(Mir100Simulation):
         return counts | ({"stale_action": self._stale_actions} if self._stale_actions else {})
 
     def _mirror(self) -> None:
-        """Put the model where the base is; wait, standing, for a state that may be acted on."""
+        """Set the model to the base's pose; hold and wait until its state is fresh."""
         limit = time.monotonic() + FRESH_S
         state = self._base.state()
         while time.monotonic() - state.received_s + state.age_s > AGE_BOUND_S and not self._note_fault():
             if time.monotonic() > limit:
                 self.hold()
                 self.stopped_by = "stale_observation"
-                self.states.enter(State.FAULT, f"odometry or scan is old, for {FRESH_S:g} s")
+                self.states.enter(State.FAULT, f"odometry or scan is still old after {FRESH_S:g} s")
                 break
             time.sleep(0.005)
             state = self._base.state()

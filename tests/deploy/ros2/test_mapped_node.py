@@ -108,8 +108,8 @@ def test_stale_stamps_a_lost_topic_and_a_missing_joint_are_not_acted_on(ros: Ros
 
 def test_second_node_on_the_same_topic_is_refused(ros: Ros, node: Process, bundle: Path) -> None:
     second = ros.rlservo("ros2", "--bundle", bundle, "--name", "second", "--ros-args", "-r", f"~/action:={COMMANDS}")
-    line = second.wait_for("is commanded by")
-    assert "/rlservo already: end it first" in line
+    line = second.wait_for("is already commanded by")
+    assert "/rlservo: end it first" in line
     assert second.end(0) == 2
     assert node.process.poll() is None
     assert ros.heartbeat()["state"] != "fault"

@@ -62,7 +62,7 @@ def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> 
             over = terminated or truncated
         assert info["final_status"] == "success"
         assert states <= {"blend_in", "run", "hold"}
-    assert [why for _, why in arm.controller.stop_reasons] == ["it came to its end"]
+    assert [why for _, why in arm.controller.stop_reasons] == ["it reached its end"]
 
 
 def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_taken(arm: RunningArm) -> None:
