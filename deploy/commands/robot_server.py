@@ -58,7 +58,7 @@ def robot_server_ur(
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 25.0,
     max_velocity_scale_factor: Annotated[
-        float, typer.Option(help="Share of the joints' velocity limits that is used.")
+        float, typer.Option(help="Share of the joints' velocity limits to use.")
     ] = 1.0,
     world: Annotated[str, typer.Option(help="World: empty, or a tabletop world of robo-gym.")] = "tabletop",
     model: Annotated[
@@ -128,7 +128,7 @@ def robot_server_panda(
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 30.0,
     max_velocity_scale_factor: Annotated[
-        float, typer.Option(help="Share of the joints' velocity limits that is used.")
+        float, typer.Option(help="Share of the joints' velocity limits to use.")
     ] = 0.2,
     world: Annotated[str, typer.Option(help="World: empty, or a tabletop world of robo-gym.")] = "tabletop",
     host: Host = "127.0.0.1",

@@ -169,7 +169,7 @@ class MirroredSimulation(URSimulation):
         return info
 
     def take_over(self) -> None:
-        """Let a person lead the arm from the next control cycle on, or give it back."""
+        """Let a person lead the arm from the next control cycle on, or return it to the policy."""
         self.operator.toggle()
 
     def limited(self) -> dict[str, int]:

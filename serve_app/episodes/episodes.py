@@ -56,7 +56,7 @@ class Episodes:
         self.begun: Counter[str] = Counter()
         """Sessions begun here, by policy name."""
         self.lost: Counter[str] = Counter()
-        """Requests whose session does not exist (any more), by policy name."""
+        """Requests for a session that does not exist or was lost, by policy name."""
 
     async def act(self, store: PolicyStore, request: Request) -> Decision:
         """Decide for a request with episode fields, or on a stream that keeps an episode.

@@ -230,7 +230,7 @@ def _parse_document(
     for tensor in tensors:
         name, array, offset = parse_tensor(tensor, raw, offset)
         if name in inputs:
-            raise RequestError(f"input '{name[:64]}' is there twice")
+            raise RequestError(f"input '{name[:64]}' is given twice")
         inputs[name] = array
     if offset != len(raw):
         raise RequestError(f"the body has {len(raw) - offset} bytes after the last tensor's data")

@@ -143,7 +143,7 @@ class VersionStatus(BaseModel):
     state: str = Field(description="`loading`, `ready` or `failed`.")
     reason: str = Field(description="Why it failed; empty otherwise.")
     aliases: list[str]
-    loaded_at: str | None = Field(description="UTC time at which this process had loaded and proven it.")
+    loaded_at: str | None = Field(description="UTC time at which this process finished loading and proving it.")
     requests: int = Field(description="Requests answered by this process, over all protocols.")
 
 

@@ -1,4 +1,4 @@
-"""Checks of a request before its body is read: the form of its path, the host it names, the page it is from, its key.
+"""Checks of a request before its body is read: form of the path, host, origin of the page, API key.
 
 A browser lets any page send requests to any address that it reaches, including the robot's own computer, and lets it
 read the answers if the page's name resolves to that address ("DNS rebinding"). So a request names the host it is for,

@@ -202,7 +202,7 @@ def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningA
 
 
 def test_wrong_model_and_unreachable_host_are_one_sentence(arm: RunningArm) -> None:
-    with pytest.raises(RobotError, match=r"is a ur5's: ur_model says ur5e"):
+    with pytest.raises(RobotError, match=r"is a ur5's, but ur_model is ur5e"):
         RtdeArm(arm.host, "ur5e")
     with pytest.raises(RobotError, match=r"no UR controller answers at 127\.0\.0\.250"):
         RtdeArm("127.0.0.250", "ur5")

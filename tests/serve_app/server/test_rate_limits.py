@@ -198,7 +198,7 @@ def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
 
     *good, refused = asyncio.run(calls())
     assert [context.code for context in good] == [None] * BURST
-    assert refused.code is grpc.StatusCode.RESOURCE_EXHAUSTED and "'cell-7' may ask" in refused.details
+    assert refused.code is grpc.StatusCode.RESOURCE_EXHAUSTED and "'cell-7' allows" in refused.details
     assert refused.trailing["rlservo-code"] == "rate-limited" and 900 < int(refused.trailing["retry-after"]) <= 1000
 
 
