@@ -108,7 +108,7 @@ def test_a_state_stays_with_its_version_whatever_becomes_the_default(
     assert server.act("leaky", state={})[1]["version"] == "2"  # the next episode is the new version's
 
     status, reply = server.act("leaky/versions/2", state=first["state"])
-    assert (status, reply["code"]) == (409, "session-conflict") and "is of version 1" in reply["error"]
+    assert (status, reply["code"]) == (409, "session-conflict") and "belongs to version 1" in reply["error"]
     status, reply = server.act("other", state=first["state"])
     assert (status, reply["code"]) == (410, "session-lost") and "'leaky/1#" in reply["error"]
     server.store = store_of(versions["2"])

@@ -429,7 +429,7 @@ def test_the_models_metadata_lists_states_and_leaves_and_a_raw_body_is_refused(p
     ]  # fmt: skip
     connection.request("POST", "/v2/models/lstm_box/infer", b"\0" * 12, {"Inference-Header-Content-Length": "0"})
     reply = connection.getresponse()
-    assert reply.status == 400 and b"is for models of one input" in reply.read()
+    assert reply.status == 400 and b"is for models with one input" in reply.read()
     connection.close()
 
 

@@ -256,7 +256,7 @@ def test_the_models_name_may_be_said_again(ask: Ask) -> None:
         ({"inputs": []}, 400, "'inputs' must be a list of tensors"),
         ({"inputs": [7]}, 400, "must be an object, got the number 7"),
         (request(tensor(ROW, [1, 27])) | {"extra": 1}, 400, "unknown field 'extra'"),
-        (request(tensor(ROW, [1, 27])) | {"model_name": "ur10"}, 400, "'model_name' is not 'ur5'"),
+        (request(tensor(ROW, [1, 27])) | {"model_name": "ur10"}, 400, "'model_name' differs from 'ur5'"),
         (request(tensor(ROW, [1, 27]), id=7), 400, "'id' must be a string, got the number 7"),
         (request(tensor(ROW, [27])), 422, "expects input 'obs' of shape [-1, 27] (-1 is the batch), got [27]"),
         (request(tensor([], [0, 27])), 422, "got an empty batch"),

@@ -175,7 +175,7 @@ def test_arrays_of_msgpack_numpy_are_read_as_data(port: int, store: PolicyStore)
         }
         np.testing.assert_array_equal(client.infer({"obs": named})["actions"][0], expected(store))
     for changes in ({"kind": b"O"}, {"kind": b"V"}, {"type": "|O"}, {"type": 7}, {"shape": [28]}, {"data": "x"}):
-        with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="an array in the message"):
+        with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="array in the message"):
             client.infer({"obs": as_msgpack_numpy(OBS, **changes)})
 
 
@@ -256,7 +256,7 @@ def test_without_a_default_policy_the_root_says_where_to_connect(store: PolicySt
     with served(create_app(lambda: store, ServerSettings())) as port:
         with pytest.raises(InvalidStatus) as caught:
             OpenpiClient(port)
-        assert b"no default policy, but gridworld, unsafe, ur5" in (caught.value.response.body or b"")
+        assert b"no default policy among gridworld, unsafe, ur5" in (caught.value.response.body or b"")
 
 
 def test_a_server_that_is_loading_refuses_streams_with_503(served: Serve) -> None:
