@@ -107,7 +107,7 @@ def start_from(checkpoint: Path, recorded: Recorded) -> Start:
     files = locate_checkpoint(checkpoint)
     if not isinstance(files, CheckpointFiles) or not files.has_pipelines or files.is_one_of_several:
         raise errors.UsageError(
-            f"--from {checkpoint}: expected a checkpoint of RLlib's new API stack, of one agent, with its connectors"
+            f"--from {checkpoint}: expected a checkpoint of RLlib's new API stack, with one agent and its connectors"
         )
     env_to_module = EnvToModulePipeline.from_checkpoint(str(files.env_to_module))
     module_to_env = ModuleToEnvPipeline.from_checkpoint(str(files.module_to_env))

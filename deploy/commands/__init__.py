@@ -1,1 +1,1 @@
-"""Commands of `rlservo`, a file for each: options and printing; the work is in the other folders."""
+"""Commands of `rlservo`, one file each, with options and output; the work is in the other folders."""

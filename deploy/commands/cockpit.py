@@ -21,38 +21,38 @@ PORT = 8090
 
 
 def cockpit(
-    url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
+    url: Annotated[str | None, typer.Option(help="Server that gives the actions.")] = None,
     policy: Annotated[str | None, typer.Option(help="Policy name; the first one by default.")] = None,
     version: Annotated[str | None, typer.Option(help="Version or alias; production by default.")] = None,
     bundle: Annotated[
-        Path | None, typer.Option(help="Act in process with this bundle, or with those of this folder.")
+        Path | None, typer.Option(help="Act in process with this bundle, or with the bundles in this folder.")
     ] = None,
     env: Annotated[
-        str | None, typer.Option(help="Environment id (rlservo/...); by default the one the policy was trained in.")
+        str | None, typer.Option(help="Environment id (rlservo/...); by default the policy's training environment.")
     ] = None,
     env_arg: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
     ] = None,
     recording: Annotated[
-        Path | None, typer.Option(help="Show a recording (.mcap); with --bundle also that bundle's actions.")
+        Path | None, typer.Option(help="Show a recording (.mcap); with --bundle, also that bundle's actions.")
     ] = None,
     robot_server: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Show a robot server's simulation while a client drives it.")
     ] = None,
     record: Annotated[
-        Path | None, typer.Option(help="Record what is driven, and who drives, into a new .mcap file or a folder.")
+        Path | None, typer.Option(help="Record the episodes, and who drives, into a new .mcap file or a folder.")
     ] = None,
     unproven: Annotated[
-        bool, typer.Option("--unproven", help="Real robot: take a policy that no evaluation under latency proves.")
+        bool, typer.Option("--unproven", help="Real robot: accept a policy without an evaluation under latency.")
     ] = False,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page, on 127.0.0.1.")] = PORT,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page on 127.0.0.1.")] = PORT,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the first episode.")] = None,
     api_key: Annotated[
         str | None,
         typer.Option(envvar="RLSERVO_API_KEY", help="API key. Prefer the variable: other users can see arguments."),
     ] = None,
 ) -> None:
-    """Show in the browser how a policy drives a robot.
+    """Show a policy driving a robot in the browser.
 
     Drag its target, read its observations. Ctrl-C ends it.
 
@@ -61,13 +61,13 @@ def cockpit(
     shown = [url, recording, robot_server, None if recording is not None else bundle]
     if sum(each is not None for each in shown) != 1:
         raise UsageError(
-            "give one of --url (a server), --bundle (in process), --recording (with or without --bundle) and "
+            "expected one of --url (a server), --bundle (in process), --recording (with or without --bundle) and "
             "--robot-server"
         )
     if record is not None and (recording is not None or robot_server is not None):
-        raise UsageError("--record goes with --url and --bundle")
+        raise UsageError("--record needs --url or --bundle")
     arguments = parse_env_arguments(env_arg or [])
-    if "robot" in arguments:  # each change of its state is a line
+    if "robot" in arguments:  # prints a line per change of its state
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     with needs_extra("cockpit"):
         from rlservo.deploy.cockpit.run import run_drive, run_playback, run_watch
@@ -94,7 +94,7 @@ def cockpit(
 
 
 def drive_on_page(url: str, port: int) -> None:
-    """Show on a page robots driven by a server's policies, until an interrupt."""
+    """Show robots driven by a server's policies on a page, until an interrupt."""
     with needs_extra("cockpit"):
         from rlservo.deploy.cockpit.run import run_drive
 

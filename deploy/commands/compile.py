@@ -13,7 +13,7 @@ from rlservo.export.contract.extras import needs_extra
 
 
 def compile(
-    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder for its newest version.")],
     out: Annotated[Path, typer.Option(help="Folder for the C files; an earlier one of the same policy is replaced.")],
     cc: Annotated[
         str | None, typer.Option(help="C compiler for the proof; $CC or the machine's own by default.")
@@ -23,10 +23,10 @@ def compile(
     ] = "c",
     as_json: Json = False,
 ) -> None:
-    """Turn a bundle into one C99 file without dependencies. It is compiled and proven equal to onnxruntime.
+    """Convert a bundle to one C99 file without dependencies, compiled and proven equal to onnxruntime.
 
-    A difference is an error, and nothing is written. Without a C compiler the files are written and called unproven;
-    the self-test next to them proves them on a machine with one.
+    A difference is an error, and nothing is written. Without a C compiler the files are written but marked unproven;
+    the self-test next to them proves them on a machine that has one.
 
     Example: `rlservo compile policies/ur5 --out build`
     """
@@ -44,8 +44,8 @@ def compile(
         lines.append(f"unproven  {made.about['unproven']}")
     else:
         lines += [
-            f"proven    {proof.golden_vectors} golden vectors, {proof.observations:,} observations beside onnxruntime, "
-            f"largest difference {proof.max_abs:.2g} ({proof.max_rel:.0%} of what is allowed)",
+            f"proven    {proof.golden_vectors} golden vectors, {proof.observations:,} observations compared with "
+            f"onnxruntime, largest difference {proof.max_abs:.2g} ({proof.max_rel:.0%} of what is allowed)",
             f"rounding  {proof.rounding_used} observations beyond the contract's tolerance, by no more than rounding "
             f"explains (at most {proof.rounding_most:.0f} times the tolerance)",
             f"step      {proof.step_us['median']:.1f} µs median, {proof.step_us['slowest_observation']:.1f} µs for the "

@@ -24,9 +24,9 @@ def demo(
         bool,
         typer.Option("--cockpit", help="Open a page to drive both robots, until Ctrl-C, instead of running episodes."),
     ] = False,
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of that page, on 127.0.0.1.")] = 8090,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of that page on 127.0.0.1.")] = 8090,
 ) -> None:
-    """Export two policies, serve them and drive both robots. The checkpoints are those that ship with the project.
+    """Export two policies, serve them and drive both robots, with the checkpoints that ship with the project.
 
     Example: `rlservo demo` in the checkout (`make demo` installs everything first)
     """

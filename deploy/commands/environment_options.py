@@ -1,4 +1,4 @@
-"""Options of a command's environment: constructor arguments, and drawing without a display."""
+"""Options for a command's environment: constructor arguments, and rendering without a display."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def require_robot(robot: str) -> None:
 
 
 def choose_gl_backend() -> None:
-    """Let MuJoCo render off screen if there is no display. It must be set before mujoco is imported."""
+    """Let MuJoCo render off screen if there is no display. Must be called before mujoco is imported."""
     if "MUJOCO_GL" in os.environ or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         return
     from ctypes.util import find_library  # it imports subprocess

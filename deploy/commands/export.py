@@ -24,17 +24,17 @@ def export(
         ),
     ],
     out: Annotated[Path, typer.Option(help="Repository folder; the bundle goes to OUT/<name>/<version>/.")],
-    name: Annotated[str | None, typer.Option(help="Policy name; the environment's by default.")] = None,
-    version: Annotated[str | None, typer.Option(help="Integer or x.y.z; the next integer by default.")] = None,
-    description: Annotated[str, typer.Option(help="A sentence about the policy, stored in the contract.")] = "",
+    name: Annotated[str | None, typer.Option(help="Policy name; by default the environment's.")] = None,
+    version: Annotated[str | None, typer.Option(help="An integer or x.y.z; the next integer by default.")] = None,
+    description: Annotated[str, typer.Option(help="Description of the policy, stored in the contract.")] = "",
     module_id: Annotated[
-        str | None, typer.Option(help="RLModule to export (old API stack: policy); required if there are several.")
+        str | None, typer.Option(help="RLModule (old API stack: policy) to export; required if there are several.")
     ] = None,
     all_modules: Annotated[
-        bool, typer.Option("--all-modules", help="Export every module, each to OUT/<name>-<module>; all or none.")
+        bool, typer.Option("--all-modules", help="Export every module to OUT/<name>-<module>, or none of them.")
     ] = False,
     agent_id: Annotated[
-        str | None, typer.Option(help="Agent to export for, if agents that share a module have different filters.")
+        str | None, typer.Option(help="Agent whose filter to use, if agents share a module but not its filter.")
     ] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     value: Annotated[bool, typer.Option("--value/--no-value", help="Include the value head.")] = True,
@@ -46,10 +46,10 @@ def export(
         ),
     ] = False,
     source: Annotated[
-        str | None, typer.Option(help="Trainer that wrote it (rllib, sb3, rsl_rl, skrl, leapp); recognised by default.")
+        str | None, typer.Option(help="Checkpoint's trainer (rllib, sb3, rsl_rl, skrl, leapp); detected by default.")
     ] = None,
     vecnormalize: Annotated[
-        Path | None, typer.Option(help="Stable-Baselines3: vecnormalize.pkl, if it is not beside the model.")
+        Path | None, typer.Option(help="Stable-Baselines3: path of vecnormalize.pkl, if it is not beside the model.")
     ] = None,
     frame_stack: Annotated[
         int, typer.Option(min=1, help="Stable-Baselines3: number of frames that VecFrameStack stacked.")
@@ -65,14 +65,14 @@ def export(
     ] = "max",
     as_json: Json = False,
 ) -> None:
-    """Turn a checkpoint into a policy bundle. It is proven equal to the trainer's own actions, or nothing is written.
+    """Convert a checkpoint to a policy bundle. It is proven equal to the trainer's own actions, or nothing is written.
 
     Examples: `rlservo export examples/checkpoints/ur_positioning --out policies`,
     `rlservo export model.zip --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
     start = time.perf_counter()
-    from rlservo.export.contract.contract import REWARD_PATTERN  # not for `--help`
+    from rlservo.export.contract.contract import REWARD_PATTERN  # not needed for `--help`
 
     if re.fullmatch(REWARD_PATTERN, reward) is None:
         raise UsageError(f"--reward {reward[:80]!r}: expected MODULE:FUNCTION, such as my_rewards:reach")
@@ -147,11 +147,11 @@ def export(
 
 def prune(
     checkpoint: Annotated[str, typer.Argument(help="RLlib checkpoint folder or URI.")],
-    out: Annotated[Path, typer.Option(help="Folder to make; it must not exist.")],
+    out: Annotated[Path, typer.Option(help="Folder to create; it must not exist yet.")],
     module_id: Annotated[str | None, typer.Option(help="RLModule to keep; required if there are several.")] = None,
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
 ) -> None:
-    """Copy only the parts of a checkpoint that export needs. The copy is small enough to commit or to mail.
+    """Copy only the parts of a checkpoint that export needs. The copy is small enough to commit or mail.
 
     Example: `rlservo prune runs/PPO-.../checkpoint_000015 --out examples/checkpoints/mine`
     """

@@ -12,10 +12,10 @@ from rlservo.deploy.terminal import Json, print_json
 
 
 def inspect(
-    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder for its newest version.")],
     as_json: Json = False,
 ) -> None:
-    """Show a bundle's contract. It lists inputs, outputs, baked-in steps and the proof.
+    """Show a bundle's contract: inputs, outputs, baked-in steps and the proof.
 
     Example: `rlservo inspect policies/ur5`
     """

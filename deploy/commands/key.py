@@ -10,12 +10,10 @@ from rlservo.deploy.terminal import Json, note, print_json
 
 
 def key(
-    label: Annotated[str, typer.Argument(help="Label of the key, such as a robot or a person; shown in logs.")],
-    admin: Annotated[
-        bool, typer.Option("--admin", help="Make a key for administration; robots do not need one.")
-    ] = False,
+    label: Annotated[str, typer.Argument(help="Label of the key, such as a robot's or user's name; shown in logs.")],
+    admin: Annotated[bool, typer.Option("--admin", help="Make an admin key; robots do not need one.")] = False,
     explore: Annotated[
-        bool, typer.Option("--explore", help="Let the key also ask for exploring actions ('rlservo learn').")
+        bool, typer.Option("--explore", help="Let the key also request exploring actions ('rlservo learn').")
     ] = False,
     rate: Annotated[
         float | None,
@@ -26,9 +24,9 @@ def key(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make an API key. It prints the key for the client, and the line with its hash for the server's key file.
+    """Make an API key. Prints the key for the client, and the line with its hash for the server's key file.
 
-    Example: `rlservo key cell-7`; append the line to a file and name that in RLSERVO_API_KEYS_FILE
+    Example: `rlservo key cell-7`; append the line to a file named in RLSERVO_API_KEYS_FILE
     """
     from rlservo.serve_app.server.api_keys import new_key
 
@@ -36,7 +34,7 @@ def key(
     if as_json:
         print_json({"key": secret, "line": line})
         return
-    note("the key, for the client; it is not kept anywhere and not shown again:")
+    note("the key, for the client; it is not stored and not shown again:")
     print(secret)
     note("the line, for the server's key file (RLSERVO_API_KEYS_FILE):")
     print(line)

@@ -19,12 +19,14 @@ from rlservo.export.contract.extras import needs_extra, require
 
 def learn(
     checkpoint: Annotated[Path, typer.Argument(help="A whole checkpoint of RLlib's PPO, APPO or SAC, not pruned.")],
-    policy: Annotated[str, typer.Option(help="The served policy that learns.")],
+    policy: Annotated[str, typer.Option(help="Served policy to train.")],
     repository: Annotated[
-        str, typer.Option(metavar="DIR|URI", help="The server's repository; versions are published there.")
+        str, typer.Option(metavar="DIR|URI", help="The server's repository, where versions are published.")
     ],
-    out: Annotated[Path, typer.Option(help="The run's folder; the same command resumes from it.")],
-    recordings: Annotated[list[Path], typer.Option(help="Folder in which a server records; one for each server.")] = [],  # noqa: B006 - typer copies it
+    out: Annotated[Path, typer.Option(help="The run's folder; the same command resumes the run.")],
+    recordings: Annotated[
+        list[Path], typer.Option(help="Folder in which a server records; repeat it for each server.")
+    ] = [],  # noqa: B006 - typer copies it
     follow: Annotated[
         list[str], typer.Option(metavar="URL", help="Remote server that records; its files are copied to OUT.")
     ] = [],  # noqa: B006
@@ -32,18 +34,18 @@ def learn(
     alias: Annotated[str, typer.Option(help="Alias of the newest version.")] = "learning",
     every: Annotated[int, typer.Option(min=1, help="Updates between two versions.")] = 5,
     batch_size: Annotated[
-        int | None, typer.Option(min=1, help="Steps of whole episodes per update; the checkpoint's by default.")
+        int | None, typer.Option(min=1, help="Steps per update, in whole episodes; the checkpoint's by default.")
     ] = None,
     max_age: Annotated[
         int | None,
-        typer.Option(min=0, help="Versions by which the one that acted may be behind; PPO 1, APPO 3, SAC 10."),
+        typer.Option(min=0, help="Largest age of the acting version, in versions; by default PPO 1, APPO 3, SAC 10."),
     ] = None,
     reward: Annotated[
         Path | None,
         typer.Option(
             exists=True,
             dir_okay=False,
-            help="Python file with reward(obs, action, next_obs), instead of the contract's or the clients' rewards.",
+            help="Python file with reward(obs, action, next_obs), in place of the contract's or the clients' rewards.",
         ),
     ] = None,
     versions: Annotated[
@@ -60,17 +62,17 @@ def learn(
         str, typer.Option(metavar="SHARE", help="With --promote: allowed drop in successful episodes.")
     ] = "5%",
     max_error_rate: Annotated[
-        str, typer.Option(metavar="SHARE", help="With --promote: share of its requests that may fail.")
+        str, typer.Option(metavar="SHARE", help="With --promote: share of the version's requests that may fail.")
     ] = "1%",
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     key_file: KeyFile = None,
 ) -> None:
     """Train a served policy from the robots that use it.
 
-    Robots ask the server for `policy` under the alias and explore; the server records them. Their whole episodes train
-    the checkpoint's algorithm. Every few updates the result is exported, proven and published, the server loads it and
-    the alias moves to it: robots get it with their next episode. A version that the gate refuses reaches no robot. With
-    --promote, robots ask for `production`, and a version gets there by its canary.
+    Robots use `policy` under the alias and explore; the server records them. Their whole episodes train the
+    checkpoint's algorithm. Every few updates the result is exported, proven and published, the server loads it and the
+    alias moves to it: robots get it with their next episode. A version that the gate refuses reaches no robot. With
+    --promote, robots use `production`, and a version gets there through its canary.
 
     Example: `rlservo learn checkpoint --policy ur5 --repository policies --recordings recorded --out runs/ur5`
     """
@@ -83,16 +85,16 @@ def learn(
     from rlservo.serve_app.learning.run_folder import RunFolder
 
     for url in {server, *follow}:
-        find_key(url, key_file)  # a missing key is found out before anything is loaded
+        find_key(url, key_file)  # a missing key is detected before anything is loaded
     if not recordings and not follow:
-        raise UsageError("nothing to learn from: give --recordings FOLDER, or --follow URL of a server that records")
+        raise UsageError("nothing to learn from: give --recordings FOLDER, or --follow URL of a recording server")
     source = None if reward is None else reward.read_text()
     terms = {"checkpoint": str(checkpoint.absolute()), "policy": policy, "repository": repository}
 
     def connect(url: str) -> AdminClient:
         try:
             return AdminClient(url, api_key=find_key(url, key_file))
-        except UsageError as error:  # a server removes its own key when it ends, and writes one when it starts again
+        except UsageError as error:  # a server removes its key when it ends, and writes a new one when it restarts
             raise UnavailableError(error.message) from None
 
     with (
@@ -121,7 +123,7 @@ def learn(
             for url in follow
         ]
         followed = FollowedRecordings(recordings, terminal.note, copies, show)
-        logging.getLogger("ray").setLevel(logging.ERROR)  # of deprecated ways that RLlib itself takes
+        logging.getLogger("ray").setLevel(logging.ERROR)  # of deprecated functions that RLlib itself uses
         try:
             with user_code(app_dir):
                 learner = OnlineLearner(checkpoint, batch_size=batch_size)

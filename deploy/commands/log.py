@@ -1,4 +1,4 @@
-"""The commands `rlservo log ...`: recordings shown, converted, repaired and drawn."""
+"""The commands `rlservo log ...`: show, convert, repair and draw recordings."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 log = typer.Typer(no_args_is_help=True, help="Show, convert and draw recordings.")
 
-Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders of them.")]
-Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder: its newest version.")]
+Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders with recordings.")]
+Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder for its newest version.")]
 PolicyName = Annotated[
     str | None, typer.Option("--policy", help="Name of the recorded policy; required if the recordings hold several.")
 ]
@@ -35,7 +35,7 @@ class Format(str, Enum):
 
 @log.command()
 def info(files: Files, as_json: Json = False) -> None:
-    """Show the content of recordings, and what is missing. ROS 2 bags (.mcap) may be among them.
+    """Show the content of recordings and missing records. ROS 2 bags (.mcap) may be among them.
 
     Example: `rlservo log info recordings`
     """
@@ -76,7 +76,7 @@ def export(
         line = f"written {out}: {episodes} episodes, {frames} frames"
     else:
         identity, episodes, env = export_minari(recording, out, name=policy)
-        made_in = f"of {env}" if env else "of no environment that is installed here"
+        made_in = f"of {env}" if env else "without an installed environment"
         place = f"{PATH_VARIABLE}={shlex.quote(str(out.resolve()))}"
         line = f"written {out}: {episodes} episodes {made_in}; {place}, then minari.load_dataset({identity!r})"
     _line(line)
@@ -87,7 +87,7 @@ def repair(
     file: Annotated[Path, typer.Argument(metavar="FILE", exists=True, dir_okay=False, help="A recording (.mcap).")],
     out: Annotated[Path, typer.Option(help="New file.")],
 ) -> None:
-    """Copy a recording that was cut off into a whole file.
+    """Copy a recording that was cut off to a complete file.
 
     The copy ends with the last complete chunk and has the index that other programs need. FILE is not changed.
 
@@ -152,7 +152,7 @@ def _print_summary(summary: Summary) -> None:
 
 
 def _bag(file: dict[str, Any], summary: Summary) -> str:
-    """Say what a bag holds, and where its time is beside that of the decisions: both count from 1970."""
+    """Describe a bag's content, and the offset of its time from the decisions' time; both count from 1970."""
     topics = ", ".join(f"{topic} {count}" for topic, count in sorted(file["bag_topics"].items()))
     first_s = min((policy.first_s for policy in summary.policies), default=None)
     begins = "" if first_s is None else f", from {file['bag_first_s'] - first_s:+.1f} s of the first decision"

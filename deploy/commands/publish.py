@@ -15,9 +15,9 @@ from rlservo.export.contract.extras import needs_extra
 
 def publish(
     bundle: Annotated[
-        Path, typer.Argument(help="Bundle, policy folder (its newest version) or one-policy repository.")
+        Path, typer.Argument(help="Bundle, policy folder (for its newest version) or repository with one policy.")
     ],
-    uri: Annotated[str, typer.Argument(metavar="URI", help="s3://bucket/policies, or a folder.")],
+    uri: Annotated[str, typer.Argument(metavar="URI", help="Destination: s3://bucket/policies, or a folder.")],
     version: Annotated[
         str | None,
         typer.Option(metavar="N|next", help="Version to publish as: a number, or 'next'; the bundle's own by default."),
@@ -27,7 +27,7 @@ def publish(
     """Publish a bundle for `rlservo serve URI`. A published version never changes.
 
     The bundle is proven first. Its files are written before its line in the index, without which no server sees the
-    version; one that is there is never overwritten. Credentials come from the environment (AWS_...).
+    version; existing versions are never overwritten. Credentials come from the environment (AWS_...).
 
     Example: `rlservo publish policies/ur5 s3://bucket/policies`
     """
@@ -45,7 +45,7 @@ def publish(
                 from rlservo.export.renumber_bundle import renumber
 
                 chosen = renumber(chosen, str(version), Path(folder))
-        Policy.load(chosen.path).close()  # a bundle that no server would load is not published
+        Policy.load(chosen.path).close()  # do not publish a bundle that no server would load
         place = publish_bundle(chosen, uri, progress=terminal.note)
     contract = chosen.contract
     if as_json:

@@ -1,4 +1,4 @@
-"""The commands `rlservo replay` and `rlservo estimate`: recordings put through another bundle."""
+"""The commands `rlservo replay` and `rlservo estimate`: recordings replayed with another bundle."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
     from rlservo.serve_app.replay.estimate import EstimateReport
     from rlservo.serve_app.replay.replay import ReplayReport
 
-Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder: its newest version.")]
+Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder for its newest version.")]
 
 
 def replay(
     files: Files,
     bundle: Bundle,
     tolerance: Annotated[
-        float, typer.Option(min=0.0, help="Largest difference of an element that does not count as a change.")
+        float, typer.Option(min=0.0, help="Largest difference in an element that does not count as a change.")
     ] = 0.0,
     policy: PolicyName = None,
     as_json: Json = False,
 ) -> None:
     """Compare a bundle's actions with the recorded ones.
 
-    Exit code 0: no action would change; 1: some would; 2: the recording does not fit the bundle.
+    Exit code 0: no action changes; 1: some change; 2: the recording does not fit the bundle.
 
     Example: `rlservo replay run.mcap --bundle policies/ur5/2`
     """
@@ -63,12 +63,12 @@ def estimate(
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the bootstrap.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Estimate a bundle's return from recordings of another.
+    """Estimate a bundle's return from recordings of another bundle.
 
-    Recordings that did not explore have fitted Q evaluation alone. It is experimental: how often its interval holds
-    was counted in a one-dimensional simulation only. Drive nothing because of it.
+    Recordings without exploration only allow fitted Q evaluation. It is experimental: its interval's coverage was
+    measured only in a one-dimensional simulation. Do not base a decision to drive on it.
 
-    Exit code 0: an estimate holds by its method's own checks; 1: the recordings cannot support one.
+    Exit code 0: an estimate passes its method's own checks; 1: the recordings cannot support one.
 
     Example: `rlservo estimate recordings --bundle policies/ur5/2`
     """
@@ -95,7 +95,7 @@ def _print_replay(report: ReplayReport, seconds: float) -> None:
         f"{', '.join(report.policies)} replayed through {report.bundle}: {report.compared} decisions in {seconds:.1f} s"
     )
     if report.same_graph is not None:
-        _line(f"the graph is {'the recorded one' if report.same_graph else 'another than the recorded one'}")
+        _line(f"the graph is {'the recorded one' if report.same_graph else 'not the recorded one'}")
     _line(f"identical bit for bit: {report.identical} of {report.compared}")
     _line(f"changed by more than {report.tolerance:g}: {report.changed} ({report.changed_share:.2%})")
     if report.explored:
@@ -104,13 +104,13 @@ def _print_replay(report: ReplayReport, seconds: float) -> None:
             f"{report.largest_distribution_difference:.3g}"
         )
     if report.unsafe:
-        _line(f"the bundle's action is none of its space: {report.unsafe}")
+        _line(f"bundle's actions outside its action space: {report.unsafe}")
     if report.not_compared:
-        _line(f"not compared (no action, a gap, nothing to compare): {report.not_compared}")
+        _line(f"not compared (no action, a gap, or nothing to compare with): {report.not_compared}")
     if report.dropped:
-        _line(f"the recorder had dropped {report.dropped} records")
+        _line(f"records dropped by the recorder: {report.dropped}")
     for title, count in report.other_policies.items():
-        _line(f"not looked at: {count} decisions of {title}")
+        _line(f"skipped: {count} decisions of {title}")
     for element in report.elements:
         if element.largest:
             _line(

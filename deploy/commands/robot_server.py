@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rlservo.envs.robot_server.settings import Settings
 
 robot_server = typer.Typer(
-    help="Serve a robot to robo-gym's environments. It may be simulated or real, in place of the ROS robot server.",
+    help="Serve a simulated or real robot to robo-gym's environments, in place of the ROS robot server.",
     no_args_is_help=True,
 )
 
@@ -29,7 +29,7 @@ robot_server = typer.Typer(
 Host = Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for clients on other machines.")]
 Clock = Annotated[
     Literal["fast", "real"],
-    typer.Option(help="fast: as fast as the simulation runs; real: in real time, as on the robot."),
+    typer.Option(help="fast: at the simulation's full speed; real: in real time, as on the robot."),
 ]
 RobotPort = Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes any free one.")]
 Gui = Annotated[bool, typer.Option("--gui", help="Show the robot in a window; needs a display.")]
@@ -42,14 +42,14 @@ Limit = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME=VALUE",
-        help="Real arm: a limit such as speed_scale=0.1 (docs/how-to/ur-arm.md); repeat it for more.",
+        help="Real arm: a limit such as speed_scale=0.1 (docs/how-to/ur-arm.md); repeatable.",
     ),
 ]
 
 
 @robot_server.command("ur")
 def robot_server_ur(
-    ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5",
+    ur_model: Annotated[str, typer.Option(help="Model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5",
     rs_mode: Annotated[
         str, typer.Option(help="Content of a state: only_robot, 1object, 1moving2points or 2objects2points.")
     ] = "only_robot",
@@ -58,9 +58,9 @@ def robot_server_ur(
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 25.0,
     max_velocity_scale_factor: Annotated[
-        float, typer.Option(help="Share of the joints' velocity limits that is used.")
+        float, typer.Option(help="Share of the joints' velocity limits to use.")
     ] = 1.0,
-    world: Annotated[str, typer.Option(help="empty, or a tabletop world of robo-gym.")] = "tabletop",
+    world: Annotated[str, typer.Option(help="World: empty, or a tabletop world of robo-gym.")] = "tabletop",
     model: Annotated[
         list[str] | None,
         typer.Option(
@@ -72,13 +72,16 @@ def robot_server_ur(
         str, typer.Option(help="mujoco, or a real arm: rtde://192.168.0.2 (extra 'ur'; docs/how-to/ur-arm.md first).")
     ] = "mujoco",
     limit: Limit = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Real arm: go to a SetState's pose without asking here.")] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Real arm: move to a SetState's pose without confirmation here.")
+    ] = False,
     metrics: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Real arm: where Prometheus reads its state and limits.")
+        str | None,
+        typer.Option(metavar="HOST:PORT", help="Real arm: address at which Prometheus reads its state and limits."),
     ] = None,
-    reference_frame: Annotated[str, typer.Option(help="base_link (simulation) or base (the real controller's).")] = (
-        "base_link"
-    ),
+    reference_frame: Annotated[
+        str, typer.Option(help="Frame: base_link (simulation) or base (the real controller's).")
+    ] = ("base_link"),
     ee_frame: Annotated[str, typer.Option(help="End effector: tool0, or Isaac Lab's tool1.")] = "tool0",
     host: Host = "127.0.0.1",
     port: RobotPort = 50051,
@@ -125,9 +128,9 @@ def robot_server_panda(
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 30.0,
     max_velocity_scale_factor: Annotated[
-        float, typer.Option(help="Share of the joints' velocity limits that is used.")
+        float, typer.Option(help="Share of the joints' velocity limits to use.")
     ] = 0.2,
-    world: Annotated[str, typer.Option(help="empty, or a tabletop world of robo-gym.")] = "tabletop",
+    world: Annotated[str, typer.Option(help="World: empty, or a tabletop world of robo-gym.")] = "tabletop",
     host: Host = "127.0.0.1",
     port: RobotPort = 50051,
     clock: Clock = "fast",
@@ -159,7 +162,7 @@ def robot_server_panda(
 
 @robot_server.command("mir100")
 def robot_server_mir100(
-    world: Annotated[str, typer.Option(help="empty or lab_6x8.")] = "empty",
+    world: Annotated[str, typer.Option(help="World: empty or lab_6x8.")] = "empty",
     host: Host = "127.0.0.1",
     port: RobotPort = 50051,
     clock: Clock = "fast",
@@ -213,16 +216,16 @@ def server_manager(
 
 def robot_latency(
     robot: Annotated[str, typer.Argument(metavar="ADDRESS", help="rtde://HOST, or ros2:NAME=VALUE,...")],
-    ur_model: Annotated[str, typer.Option(help="ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5e",
+    ur_model: Annotated[str, typer.Option(help="Model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
     limit: Limit = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Move without asking.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Move without confirmation.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Measure a real arm's latency. It prints the evaluation that a policy for this arm must pass.
+    """Measure a real arm's latency. Prints the evaluation that a policy for this arm must pass.
 
-    From command to motion: wrist_3 turns by 0.05 rad, back and forth.
+    Measures from command to motion: wrist_3 turns by 0.05 rad, back and forth.
 
     Example: `rlservo robot-latency rtde://192.168.0.2 --ur-model ur5e`
     """
@@ -253,7 +256,7 @@ def robot_latency(
         f"command to motion: p50 {report.p50_ms:.0f}, p95 {report.p95_ms:.0f}, max {report.max_ms:.0f} ms, jitter "
         f"{report.jitter_ms:.0f} ms over {steps} motions; a state every {report.state_period_ms:.3g} ms; joints at "
         f"rest within {report.noise:.1e} rad\n"
-        f"at {control_rate:g} Hz that is up to {report.cycles} cycles. The policy must pass:\n"
+        f"at {control_rate:g} Hz this is up to {report.cycles} cycles. The policy must pass:\n"
         f"rlservo verify BUNDLE {report.disturbance} --disturb --write "
         f"--env rlservo/EndEffectorPositioningURSim-v0 --env-arg ur_model={ur_model}",
         highlight=False,
@@ -268,14 +271,14 @@ def ur_controller(
     host: Annotated[
         str, typer.Option(help="Address to listen on; the ports are always 29999 and 30001 to 30004.")
     ] = "127.0.0.1",
-    latency_ms: Annotated[float, typer.Option(min=0.0, help="Delay of the link, each way.")] = 0.0,
+    latency_ms: Annotated[float, typer.Option(min=0.0, help="Delay of the link in each direction.")] = 0.0,
     jitter_ms: Annotated[float, typer.Option(min=0.0, help="Largest additional delay (jitter).")] = 0.0,
     drop: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of RTDE data packages that are lost.")] = 0.0,
 ) -> None:
     """Run the controller of a simulated UR arm until Ctrl-C. Lines on standard input stop the arm or cut the link.
 
     Example: `rlservo ur-controller --model ur5e`, then `rtde_control.RTDEControlInterface("127.0.0.1")` in Python;
-    `help` and Enter lists the lines
+    `help` and Enter lists the commands
     """
     with _one_sentence_errors():
         from rlservo.envs.ur_controller.controller import Controller
@@ -305,7 +308,7 @@ def _serve(settings: Settings, title: str) -> None:
 
 @contextmanager
 def _one_sentence_errors() -> Iterator[None]:
-    """Turn the simulators' errors into those of the command line, and name a missing extra."""
+    """Convert the simulators' errors to those of the command line, and name a missing extra."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     try:
         with needs_extra("sim", "mujoco", "grpc"):

@@ -23,30 +23,32 @@ TransportKind = Literal["http", "ws"]
 
 def rollout(
     env: Annotated[str, typer.Argument(help="Gymnasium environment id.")],
-    url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
-    policy: Annotated[str | None, typer.Option(help="Policy name on that server; its only one by default.")] = None,
+    url: Annotated[str | None, typer.Option(help="Server that gives the actions.")] = None,
+    policy: Annotated[str | None, typer.Option(help="Policy name on that server; by default its only policy.")] = None,
     bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle instead of a server.")] = None,
     episodes: Annotated[int, typer.Option(min=1)] = 10,
-    seed: Annotated[int | None, typer.Option(help="Episode i is reset with seed + i.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed; episode i is reset with seed + i.")] = None,
     rate: Annotated[
-        Literal["real", "max"], typer.Option(help="real: at the control rate, as on a robot; max: as fast as it goes.")
+        Literal["real", "max"], typer.Option(help="real: at the control rate, as on a robot; max: at full speed.")
     ] = ("max"),
-    explore: Annotated[bool, typer.Option("--explore", help="Sample actions instead of taking the mode.")] = False,
+    explore: Annotated[
+        bool, typer.Option("--explore", help="Sample actions from the distribution instead of taking its mode.")
+    ] = False,
     env_arg: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
     ] = None,
     video: Annotated[Path | None, typer.Option(help="Write the first episode to this .mp4 file.")] = None,
     transport: Annotated[
-        TransportKind, typer.Option(help="http: JSON, a request per action; ws: one WebSocket.")
+        TransportKind, typer.Option(help="http: one JSON request per action; ws: one WebSocket.")
     ] = "http",
     deadline_ms: Annotated[
-        float | None, typer.Option(help="Deadline for each action; a later one is not used.")
+        float | None, typer.Option(help="Deadline for each action; late actions are not used.")
     ] = None,
     fallback: Annotated[
         str | None,
         typer.Option(
             metavar="hold|zero|stop|ACTION",
-            help="What the robot does if an action is late; by default the command fails.",
+            help="Command to the robot if an action is late; by default the rollout fails.",
         ),
     ] = None,
     server_state: Annotated[
@@ -66,20 +68,20 @@ def rollout(
             help="Disturbances to drive under, such as latency=3,noise=real,payload=3; see `rlservo verify -h`.",
         ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Real robot: move to a start without asking.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Real robot: move to a start without confirmation.")] = False,
     unproven: Annotated[
-        bool, typer.Option("--unproven", help="Real robot: accept a policy that no evaluation under latency proves.")
+        bool, typer.Option("--unproven", help="Real robot: accept a policy without an evaluation under latency.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Drive an environment with a policy. Success, return, latency and deadline misses are reported.
+    """Drive an environment with a policy. Reports success, return, latency and deadline misses.
 
     Example: `rlservo rollout rlservo/EndEffectorPositioningURSim-v0 --url http://127.0.0.1:8000 --policy ur5`
     """
     if (url is None) == (bundle is None):
-        raise UsageError("give either --url (a server) or --bundle (in process)")
+        raise UsageError("expected either --url (a server) or --bundle (in process)")
     if bundle is not None and (fallback, deadline_ms, transport) != (None, None, "http"):
-        raise UsageError("--transport, --deadline-ms and --fallback are for a server (--url)")
+        raise UsageError("--transport, --deadline-ms and --fallback need a server (--url)")
     arguments = parse_env_arguments(env_arg or []) | ({"confirm": False} if yes else {})
     if "robot" in arguments:
         require_robot(str(arguments["robot"]))
@@ -129,7 +131,7 @@ def acting_policy(
     server_state: bool,
     api_key: str | None,
 ) -> ActingPolicy:
-    """Return the policy to drive with; in process it needs no HTTP client."""
+    """Return the policy; in process it needs no HTTP client."""
     if bundle is not None:
         from rlservo.serve_app.runtime.compiled_policy import open_policy
 
@@ -143,7 +145,7 @@ def acting_policy(
 
 
 def with_fallback(policy: ActingPolicy, fallback: str | None) -> ActingPolicy:
-    """Return the policy with what a late action becomes. Raises UsageError."""
+    """Return the policy with the fallback for late actions. Raises UsageError."""
     if fallback is None:
         return policy
     from rlservo.serve_app.rollout.fallback import WithFallback

@@ -24,34 +24,34 @@ if TYPE_CHECKING:
 
 def ros2(
     bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle.")] = None,
-    url: Annotated[str | None, typer.Option(help="Server to ask for actions.")] = None,
-    policy: Annotated[str | None, typer.Option(help="Policy name on that server; its only one by default.")] = None,
+    url: Annotated[str | None, typer.Option(help="Server that gives the actions.")] = None,
+    policy: Annotated[str | None, typer.Option(help="Policy name on that server; by default its only policy.")] = None,
     robot: Annotated[
-        str, typer.Option(help="Address of an arm or base of ours: ros2:NAME=VALUE,... (topics, prefix, command).")
+        str, typer.Option(help="Address of a supported arm or base: ros2:NAME=VALUE,... (topics, prefix, command).")
     ] = "ros2:",
     env_arg: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment argument: ur_model=ur5e, limits={...}.")
     ] = None,
     mapping: Annotated[
         Path | None,
-        typer.Option(exists=True, dir_okay=False, help="ROS 2 parameter file: where elements are in messages."),
+        typer.Option(exists=True, dir_okay=False, help="ROS 2 parameter file that maps elements to message fields."),
     ] = None,
     name: Annotated[str, typer.Option(help="The node's name.")] = "rlservo",
     rate: Annotated[
         float | None, typer.Option(min=0.1, help="Mapped elements: control rate [Hz], instead of the contract's.")
     ] = None,
     max_age: Annotated[
-        float | None, typer.Option(min=0.01, help="Mapped elements: age [s] of an input that is not acted on.")
+        float | None, typer.Option(min=0.01, help="Mapped elements: age [s] beyond which an input is not used.")
     ] = None,
-    autostart: Annotated[bool, typer.Option("--autostart", help="Run without a call of the start service.")] = False,
+    autostart: Annotated[bool, typer.Option("--autostart", help="Start without a call of the start service.")] = False,
     transport: Annotated[TransportKind, typer.Option(help="With --url: http or ws.")] = "http",
     deadline_ms: Annotated[float | None, typer.Option(help="With --url: deadline for each action.")] = None,
     fallback: Annotated[
-        str | None, typer.Option(metavar="hold|zero|stop|ACTION", help="With --url: what a late action becomes.")
+        str | None, typer.Option(metavar="hold|zero|stop|ACTION", help="With --url: replacement for a late action.")
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Record into a new .mcap file or a folder.")] = None,
     unproven: Annotated[
-        bool, typer.Option("--unproven", help="Take a policy that was never evaluated under latency.")
+        bool, typer.Option("--unproven", help="Accept a policy that was never evaluated under latency.")
     ] = False,
     ros_args: Annotated[
         list[str] | None, typer.Argument(metavar="--ros-args ...", help="Remappings and parameters, as for any node.")
@@ -59,14 +59,14 @@ def ros2(
 ) -> None:
     """Drive a robot as a ROS 2 node until Ctrl-C.
 
-    A policy of one of our environments drives its robot to each pose on ~/target. Any other policy's observation and
-    action elements are fields of messages, by their names or by --mapping. Services: ~/start, ~/hold, ~/stop,
-    ~/version; heartbeat: /diagnostics.
+    A policy of a built-in environment drives its robot to each pose on ~/target. Any other policy's observation and
+    action elements are mapped to message fields, by name or by --mapping. Services: ~/start, ~/hold, ~/stop, ~/version;
+    heartbeat: /diagnostics.
 
     Example: `rlservo ros2 --bundle policies/ur_positioning --env-arg ur_model=ur5e`
     """
     if (url is None) == (bundle is None):
-        raise UsageError("give either --url (a server) or --bundle (in process)")
+        raise UsageError("expected either --url (a server) or --bundle (in process)")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     _pass_ros_arguments(ros_args or [], mapping)
     with needs_extra("sim", "mujoco", "gymnasium"):
@@ -99,26 +99,29 @@ def ros2(
 
 
 def ros2_sim(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="mir100, or an arm: ur3e, ur5, ur5e, ur10e ...")],
+    robot: Annotated[
+        str, typer.Argument(metavar="ROBOT", help="Robot: mir100, or an arm (ur3e, ur5, ur5e, ur10e ...).")
+    ],
     controller: Annotated[
-        Literal["position", "velocity", "trajectory"], typer.Option(help="Arm: the controller that is active.")
+        Literal["position", "velocity", "trajectory"], typer.Option(help="Arm: the active controller.")
     ] = "position",
-    prefix: Annotated[str, typer.Option(help="Arm: before the joints' names.")] = "",
-    world: Annotated[str, typer.Option(help="Base: empty or lab_6x8.")] = "empty",
+    prefix: Annotated[str, typer.Option(help="Arm: prefix of the joint names.")] = "",
+    world: Annotated[str, typer.Option(help="Base: world, empty or lab_6x8.")] = "empty",
     twist: Annotated[Literal["Twist", "TwistStamped"], typer.Option(help="Base: type of /cmd_vel.")] = "Twist",
     rosbridge_port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="Base: a rosbridge on this port of 127.0.0.1; 0: any free.")
+        int | None,
+        typer.Option(min=0, max=65535, help="Base: offer a rosbridge on this port of 127.0.0.1; 0: any free port."),
     ] = None,
     ros: Annotated[bool, typer.Option("--ros/--no-ros", help="Base: join the ROS 2 graph.")] = True,
 ) -> None:
-    """Offer a simulated robot's ROS 2 topics until Ctrl-C.
+    """Simulate a robot with its ROS 2 topics until Ctrl-C.
 
     Lines on standard input stop it, move it or cut the link (`help` lists them).
 
     Example: `rlservo ros2-sim ur5e`, or without ROS `rlservo ros2-sim mir100 --no-ros --rosbridge-port 9090`
     """
     if robot == "mir100" and not ros and rosbridge_port is None:
-        raise UsageError("--no-ros needs --rosbridge-port: the robot would have no link at all")
+        raise UsageError("--no-ros needs --rosbridge-port: otherwise the robot has no link")
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     with needs_extra("sim", "mujoco"):
         from rlservo.envs.robots.arm import RobotError
@@ -166,7 +169,7 @@ def ros2_sim(
 
 
 def _pass_ros_arguments(words: list[str], mapping: Path | None) -> None:
-    """Give ROS's own arguments to this process' nodes and to those of the processes that it starts."""
+    """Pass ROS's own arguments to the nodes of this process and of the processes that it starts."""
     rest = [word for word in words if word not in ("--ros-args", "--")]
     if mapping is not None:
         rest += ["--params-file", str(mapping.resolve())]

@@ -26,14 +26,14 @@ ConfigOption = Annotated[
 ]
 VersionsOption = Annotated[
     list[str] | None,
-    typer.Option("--versions", metavar="NAME=VERSION,...", help="Versions to load; all of the repository by default."),
+    typer.Option("--versions", metavar="NAME=VERSION,...", help="Versions to load; by default all in the repository."),
 ]
 AliasOption = Annotated[
     list[str] | None,
     typer.Option(
         "--alias",
         metavar="NAME:ALIAS=VERSION",
-        help="Alias for a new plan, such as ur5:production=3; repeat it. The newest version is production by default.",
+        help="Alias for a new plan, such as ur5:production=3; repeatable. By default the newest version is production.",
     ),
 ]
 CanaryOption = Annotated[
@@ -43,7 +43,7 @@ CanaryOption = Annotated[
 ShadowOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--shadow", metavar="NAME=VERSION", help="Version that runs in parallel, only to compare its actions."
+        "--shadow", metavar="NAME=VERSION", help="Version that runs in parallel, only for comparison of its actions."
     ),
 ]
 
@@ -52,7 +52,8 @@ def serve(
     directories: Annotated[
         list[str],
         typer.Argument(
-            metavar="DIR|URI...", help="Bundles, policy folders, repositories; s3://... as `rlservo publish` writes it."
+            metavar="DIR|URI...",
+            help="Bundles, policy folders or repositories, also s3://... as written by `rlservo publish`.",
         ),
     ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
@@ -61,7 +62,7 @@ def serve(
         int | None,
         typer.Option(min=1, max=65535, help="Also serve the Open Inference Protocol over gRPC on this port."),
     ] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Server processes; each holds all policies.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Number of server processes; each holds all policies.")] = 1,
     default_policy: Annotated[
         str | None,
         typer.Option(
@@ -74,7 +75,9 @@ def serve(
     ] = None,
     poll: Annotated[
         float | None,
-        typer.Option(min=1, metavar="SECONDS", help="Look for new versions this often; they are loaded but not used."),
+        typer.Option(
+            min=1, metavar="SECONDS", help="How often to look for new versions, which are loaded but not used."
+        ),
     ] = None,
     session_store: Annotated[
         str | None,
@@ -140,7 +143,7 @@ def served_config(
     canaries: list[str] | None,
     shadows: list[str] | None,
 ) -> dict[str, Any]:
-    """Return the configuration that the file and the options of `rlservo serve` mean; options win.
+    """Return the configuration from the file and the options of `rlservo serve`; options win.
 
     Raises UsageError.
     """
@@ -171,7 +174,7 @@ def _load_config(file: Path) -> dict[str, Any]:
     except ValueError as error:
         raise UsageError(f"{file} cannot be read: {' '.join(str(error).split())[:300]}") from None
     if not isinstance(document, dict) or not isinstance(document.get("policies", {}), dict):
-        raise UsageError(f"{file}: expected a map with 'policies', as user_config in deploy/serve.yaml")
+        raise UsageError(f"{file}: expected a map with 'policies', like user_config in deploy/serve.yaml")
     return document
 
 
@@ -187,7 +190,7 @@ def _parse_yaml(text: str) -> Any:
 
 
 def split_pair(text: str, example: str, separator: str = "=") -> tuple[str, str]:
-    """Return the words before and after the separator. Raises UsageError, with the example."""
+    """Return the words before and after the separator. Raises UsageError, which shows the example."""
     key, found, value = text.partition(separator)
     if not key or not found:
         raise UsageError(f"{text!r}: expected something like {example}")

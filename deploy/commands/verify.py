@@ -1,4 +1,4 @@
-"""The command `rlservo verify`: against the checkpoint, and with `--disturb` in the simulator.
+"""The command `rlservo verify`: compare with the checkpoint, or with `--disturb` drive the simulator.
 
 The table of disturbances goes to the terminal, as JSON, as a plot and into the contract.
 """
@@ -23,56 +23,58 @@ if TYPE_CHECKING:
     from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable
 
 EPISODES = 100  # of each row by default
-WIDTH = 140  # [characters], of the table at least: narrower its figures fall apart
+WIDTH = 140  # [characters], smallest width of the table: in a narrower one the figures wrap
 
 
 def verify(
-    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder: its newest version.")],
+    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder for its newest version.")],
     disturbances: Annotated[
         list[str] | None,
         typer.Argument(
             metavar="[KIND=SIZE]...",
-            help="With --disturb, the rows of the table, such as latency=3 or noise=real,payload=2; the standard ones "
-            "by default. Kinds: latency, observation_latency, late [cycles], drop [share], noise, bias (real, 2*real), "
-            "stuck (any or an element), payload [kg], model [share], base [m], target=outside, start=corner.",
+            help="With --disturb: rows of the table, such as latency=3 or noise=real,payload=2; standard rows by "
+            "default. Kinds: latency, observation_latency, late [cycles], drop [share], noise, bias (real, "
+            "2*real), stuck (any or an element), payload [kg], model [share], base [m], target=outside, "
+            "start=corner.",
         ),
     ] = None,
     checkpoint: Annotated[str | None, typer.Option(help="Checkpoint to compare with; a path or a URI.")] = None,
-    source: Annotated[str | None, typer.Option(help="Which trainer wrote --checkpoint; the path tells it.")] = None,
+    source: Annotated[str | None, typer.Option(help="Trainer that wrote --checkpoint; detected by default.")] = None,
     vecnormalize: Annotated[
-        Path | None, typer.Option(help="Of Stable-Baselines3, vecnormalize.pkl where it is not beside the checkpoint.")
+        Path | None, typer.Option(help="Stable-Baselines3: vecnormalize.pkl, if it is not beside the checkpoint.")
     ] = None,
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
     disturb: Annotated[
-        bool, typer.Option("--disturb", help="Drive --env under disturbances: noise, latency, payload and others.")
+        bool, typer.Option("--disturb", help="Drive --env under disturbances such as noise, latency and payload.")
     ] = False,
     episodes: Annotated[
-        int | None, typer.Option(min=1, help="Episodes of the closed loop (20), of each row under --disturb (100).")
+        int | None,
+        typer.Option(min=1, help="Episodes in the closed loop (default 20), or per row of --disturb (default 100)."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = 0,
     env_arg: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=VALUE", help="With --disturb or --compiled, environment constructor argument (JSON)."
+            metavar="NAME=VALUE", help="With --disturb or --compiled: environment constructor argument (JSON)."
         ),
     ] = None,
-    plot: Annotated[Path | None, typer.Option(help="With --disturb, draw the table into this file.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="With --disturb: plot the table to this file.")] = None,
     compiled: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of `rlservo compile`: drive --env with it as well; equal seeds must end the same way."
+            help="Folder from `rlservo compile`: also drive --env with it; equal seeds must end the same way."
         ),
     ] = None,
     write: Annotated[
-        bool, typer.Option("--write", help="With --disturb, write the rows into the contract as evaluations.")
+        bool, typer.Option("--write", help="With --disturb: write the rows to the contract as evaluations.")
     ] = False,
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     as_json: Json = False,
 ) -> None:
-    """Prove a bundle against its checkpoint again. With --env it also drives episodes and adds them to the contract.
+    """Prove a bundle against its checkpoint again. With --env, also drive episodes and add them to the contract.
 
-    With --disturb it drives the simulator with latency, noise and more, and needs no checkpoint: success,
-    return and endings under each disturbance, over the same seeds.
+    With --disturb, drive the simulator with latency, noise and more, without a checkpoint: success, return and endings
+    under each disturbance, over the same seeds.
 
     Examples: `rlservo verify policies/ur5 --checkpoint runs/best --env rlservo/EndEffectorPositioningURSim-v0`,
     `rlservo verify policies/ur5 --env rlservo/EndEffectorPositioningURSim-v0 --disturb`,
@@ -86,7 +88,7 @@ def verify(
         raise UsageError("--env-arg needs --disturb or --compiled")
     env = env and plain_id(env)
     if checkpoint is None and not disturb and compiled is None:
-        raise UsageError("give --checkpoint to compare the bundle with, or --env with --disturb or --compiled")
+        raise UsageError("expected --checkpoint to compare the bundle with, or --env with --disturb or --compiled")
     document: dict[str, Any] = {}
     if compiled is not None:
         document |= _verify_compiled(compiled, bundle, env, episodes or 20, seed, env_arg or [], as_json)
@@ -114,13 +116,13 @@ def verify(
 def _verify_against(
     checkpoint: str, bundle: Path, env: str | None, episodes: int, seed: int, files: dict[str, Any], as_json: bool
 ) -> dict[str, Any]:
-    """Compare a bundle with its checkpoint; return the document for programs, and print it for people otherwise."""
+    """Compare a bundle with its checkpoint; return the JSON document, or print a report."""
     with needs_extra("train", "gymnasium"):
         from rlservo.export.reports import verification_report
         from rlservo.export.verify_bundle import verify_bundle
 
     env_config = None
-    if env is not None:  # the policy may have been trained with disturbances around this environment
+    if env is not None:  # the policy may have been trained with disturbances of this environment
         from rlservo.envs.randomization import wrapped_env
         from rlservo.export.contract.bundle import load_bundle
 
@@ -151,9 +153,9 @@ def _verify_against(
 def _verify_compiled(
     compiled: Path, bundle: Path, env_id: str | None, episodes: int, seed: int, env_arg: list[str], as_json: bool
 ) -> dict[str, Any]:
-    """Drive the environment with the bundle and with its C. Raises ParityError if an episode ends differently."""
+    """Drive the environment with the bundle and its C code. Raises ParityError if an episode ends differently."""
     if env_id is None:
-        raise UsageError("--compiled needs --env: the environment to drive")
+        raise UsageError("--compiled needs --env, the environment to drive")
     with needs_extra("sim", "gymnasium"):
         from rlservo.envs.randomization import wrapped_env
         from rlservo.serve_app.rollout.control_loop import rollout
@@ -162,14 +164,14 @@ def _verify_compiled(
 
     with Policy.load(bundle) as ours, CompiledPolicy(compiled) as theirs, terminal.status("driving both") as show:
         if ours.digest != theirs.digest:
-            raise UsageError(f"{compiled} was compiled from another bundle than {ours.path}")
+            raise UsageError(f"{compiled} was not compiled from {ours.path}")
         trained = ours.contract.provenance
         arguments = {**wrapped_env(trained.env_id or "", trained.env_config)[1], **parse_env_arguments(env_arg)}
         reports = []
         for policy, name in ((ours, "the bundle"), (theirs, "its C")):
             show(f"driving {env_id} with {name}")
             report = rollout(policy, env_id, episodes=episodes, seed=seed, env_kwargs=arguments)
-            if report.interrupted:  # half a comparison is none
+            if report.interrupted:  # half a comparison is useless
                 raise KeyboardInterrupt
             reports.append(report)
     pairs = list(zip(reports[0].episodes, reports[1].episodes, strict=True))
@@ -178,7 +180,7 @@ def _verify_compiled(
             raise ParityError(
                 f"episode {a.index} (seed {a.seed}) ends differently: with the bundle '{a.final_status}' after "
                 f"{a.steps}"
-                f" steps, with its C '{b.final_status}' after {b.steps}"
+                f" steps, with its C code '{b.final_status}' after {b.steps}"
             )
     apart = max(abs(a.episode_return - b.episode_return) for a, b in pairs)
     if not as_json:
@@ -203,11 +205,11 @@ def _measure(
 ) -> DisturbanceTable:
     """Measure a bundle under disturbances; draw and store the table if requested.
 
-    The environment is made with the `env_config` the policy was trained with, without the disturbances it was trained
-    under, and with `env_arguments`. Raises UsageError for a disturbance that does not exist or cannot be had.
+    The environment is made with the policy's training `env_config` but without its disturbances, and with
+    `env_arguments`. Raises UsageError for an unknown or unsupported disturbance.
     """
     if env_id is None:
-        raise UsageError("--disturb needs --env: the environment to disturb")
+        raise UsageError("--disturb needs --env, the environment to disturb")
     if seed < 0:
         raise UsageError(f"--seed is {seed}: expected 0 or more")
     with needs_extra("sim"):

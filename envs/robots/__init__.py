@@ -1,1 +1,1 @@
-"""Arms behind the environments: what an arm is, and a real UR arm with limits, watchdog and a state machine."""
+"""Arms behind the environments: the arm interface, and a real UR arm with limits, watchdog and state machine."""

@@ -1,4 +1,4 @@
-"""Interface of an arm: what the environments, the robot server and `robot-latency` ask of one, simulated or real."""
+"""Interface of a simulated or real arm, used by the environments, the robot server and `robot-latency`."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ STOP_NAMES = {3: "protective_stop", 5: "safeguard_stop", 6: "emergency_stop", 7:
 
 
 class RobotError(ValueError):
-    """The robot cannot be reached, is not ready, or has stopped; the message says what to do."""
+    """The robot cannot be reached, is not ready, or has stopped; the message states the remedy."""
 
 
 class ArmState(NamedTuple):
-    """An arm at a moment."""
+    """State of an arm at one moment."""
 
     positions: Vector  # [rad], (6,), base to wrist_3
     velocities: Vector  # [rad/s], (6,)
     time_s: float  # the robot's own clock
-    received_s: float  # time.monotonic() of its arrival
-    age_s: float  # how old it was then, as far as the link's delay varies
-    mode: str  # "running", or why not
-    safety: str  # "normal", or which stop
+    received_s: float  # time.monotonic() at its arrival
+    age_s: float  # its age then, as far as the link's delay varies
+    mode: str  # "running", or the reason why not
+    safety: str  # "normal", or the kind of stop
 
 
 class Arm(Protocol):
-    """An arm that is commanded joint positions, one setpoint after the other."""
+    """An arm that is commanded by joint setpoints."""
 
     def arm_state(self) -> ArmState:
         """Return the newest state."""
         ...
 
     def command(self, joint_positions: ArrayLike) -> None:
-        """Replace the setpoint: move to joint positions [rad] (6,), all joints arriving together."""
+        """Replace the setpoint: move to joint positions [rad] (6,), with all joints arriving together."""
         ...
 
     def hold(self) -> None:
-        """Stop where the arm is."""
+        """Stop at the arm's present position."""
         ...
 
 
 def host_of(robot: str) -> str | None:
-    """Return the host of 'rtde://HOST', None of 'mujoco', 'ros2:...' as it is. Raises RobotError for anything else."""
+    """Return the host of 'rtde://HOST', None for 'mujoco', 'ros2:...' unchanged. Raises RobotError otherwise."""
     if robot == MUJOCO:
         return None
     if robot.startswith(ROS2):

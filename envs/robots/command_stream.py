@@ -1,8 +1,8 @@
-"""Process that commands a real arm at its own rate: setpoints in, joint targets within limits out.
+"""Process that commands a real arm at the arm's own rate: setpoints in, joint targets within limits out.
 
-`python -m rlservo.envs.robots.command_stream '<settings>'` runs it; `rtde_arm.py` starts it. It says on standard output
-that it is ready or why not, reads setpoints from shared memory, and decelerates and ends when its standard input does.
-Whatever becomes of it, the controller's watchdog ends the program there, and the arm stops.
+`python -m rlservo.envs.robots.command_stream '<settings>'` runs it; `rtde_arm.py` starts it. It reports on standard
+output that it is ready or why not, reads setpoints from shared memory, and decelerates and exits when its standard
+input closes. If it dies, the controller's watchdog ends the program there, and the arm stops.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from rlservo.envs.robots.link_delay import LinkDelay
 from rlservo.envs.robots.shared_block import SharedBlock
 from rlservo.envs.ur.simulation import URSimulation
 
-READY, FAILED = "ready", "failed: "  # lines on standard output; a fault after "ready" is FAILED as well
+READY, FAILED = "ready", "failed: "  # lines on standard output; a fault after READY is also FAILED
 FIRST_STATE_S = 5.0
 RUNNING, SAFE_MODES = 7, (1, 2)  # robot_mode, safety_mode: normal and reduced
 STARTUP_MODES = (
     "no controller", "disconnected", "confirm safety", "booting", "power off", "power on", "idle", "backdrive",
 )  # fmt: skip
 LOST_S = 1.0  # [s] without a package, after which the connection counts as lost
-SLOW_CALL_S = 0.3  # [s] for one command; ur_rtde has lost the script or reconnected meanwhile
-AGE_BOUND_S = 0.1  # [s] of a state that may be acted on
+SLOW_CALL_S = 0.3  # [s] for one command; beyond it, ur_rtde has lost the script or reconnected
+AGE_BOUND_S = 0.1  # [s] oldest state that may be acted on
 AT_REST = 1e-3  # [rad/s]
 CLOSE_S = 4.0  # [s], for closing the connections
 VARIABLES = [
@@ -48,21 +48,21 @@ Vector = NDArray[np.float64]
 
 
 class Order(IntEnum):
-    """What the arm's process asks for."""
+    """Order of the arm's process."""
 
     HOLD = 0
-    FOLLOW = 1  # a setpoint, for as long as new ones come
-    GO = 2  # a pose, slowly
-    FREE = 3  # led by hand
+    FOLLOW = 1  # follow setpoints while new ones come
+    GO = 2  # move to a pose, slowly
+    FREE = 3  # let a person lead the arm by hand
 
 
 class Phase(IntEnum):
-    """What the stream does."""
+    """Activity of the command stream."""
 
     HOLD = 0
     FOLLOW = 1
-    LATE = 2  # holds, for no setpoint has come
-    STALE = 3  # holds, for the newest state is too old
+    LATE = 2  # holds, because no setpoint has come
+    STALE = 3  # holds, because the newest state is too old
     GO = 4
     FREE = 5
     FAULT = 6
@@ -81,7 +81,7 @@ REPORT = np.dtype(
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """What the process is started with."""
+    """Settings that the process is started with."""
 
     host: str
     ur_model: str
@@ -120,7 +120,7 @@ class _Connection:
             dashboard.disconnect()
         except RuntimeError as error:
             raise RobotError(
-                f"no UR controller answers at {host} ({str(error).strip()}): is it switched on, and on this network?"
+                f"no UR controller answers at {host} ({str(error).strip()}): is it switched on and on this network?"
             ) from error
         self.is_e_series = settings.ur_model.endswith("e")
         self.rate_hz = settings.limits.rate_hz or (500.0 if self.is_e_series else 125.0)
@@ -132,18 +132,18 @@ class _Connection:
             raise
         except Exception as error:  # RuntimeError, logic_error as RuntimeError, boost's own
             hint = "enable remote control on the pendant (local, top right)" if self.is_e_series else "see the pendant"
-            raise RobotError(f"the controller at {host} takes no program ({str(error).strip()}): {hint}") from error
-        self.control.setWatchdog(settings.limits.watchdog_hz)  # from here on commands must follow at once
+            raise RobotError(f"the controller at {host} accepts no program ({str(error).strip()}): {hint}") from error
+        self.control.setWatchdog(settings.limits.watchdog_hz)  # from here on commands must follow immediately
 
     def age_s(self) -> float | None:
-        """Return None: how old the newest state was when it came is not known, for the robot's clock is its own."""
+        """Return None: the age of a new state is unknown, because the robot has its own clock."""
         return None
 
     def _check_model(self, settings: StreamSettings, model: str, version: str) -> None:
         is_e_series = not version.startswith("3.")
         found = model.strip().lower() + ("e" if is_e_series else "")
         if found != settings.ur_model:
-            raise RobotError(f"the controller at {settings.host} is a {found}'s: ur_model says {settings.ur_model}")
+            raise RobotError(f"the controller at {settings.host} is a {found}'s, but ur_model is {settings.ur_model}")
 
     def _check_modes(self, host: str) -> None:
         limit = time.monotonic() + FIRST_STATE_S
@@ -165,14 +165,14 @@ class _Connection:
 
 
 class Connection(Protocol):
-    """A connection to the arm; `receive` and `control` have those methods of ur_rtde's that the loop calls."""
+    """A connection to the arm; `receive` and `control` have the ur_rtde methods that the loop calls."""
 
     rate_hz: float
     receive: Any
     control: Any
 
     def age_s(self) -> float | None:
-        """Return how old the newest state was when it came [s]; None where the clocks cannot be compared."""
+        """Return the age of the newest state at its arrival [s]; None if the clocks cannot be compared."""
         ...
 
     def close(self) -> None:
@@ -181,7 +181,7 @@ class Connection(Protocol):
 
 
 def connect(settings: StreamSettings) -> Connection:
-    """Return the connection that the address asks for. Raises RobotError."""
+    """Return the connection for the address. Raises RobotError."""
     if settings.host.startswith(ROS2):
         from rlservo.envs.ros2.arm import RosArmConnection
 
@@ -190,7 +190,7 @@ def connect(settings: StreamSettings) -> Connection:
 
 
 class CommandStream:
-    """The loop. `run` returns when it is told to end or at a fault, whose sentence it raises as RobotError."""
+    """The loop. `run` returns on request, and raises RobotError at a fault."""
 
     def __init__(self, settings: StreamSettings, connection: Connection, simulation: URSimulation) -> None:
         self._settings, self._limits, self._robot = settings, settings.limits, connection
@@ -210,7 +210,7 @@ class CommandStream:
         self.is_asked_to_end = threading.Event()
 
     def run(self, on_ready: Callable[[], None]) -> None:
-        """Command the arm until asked to end, after decelerating; `on_ready` is called after the first cycle."""
+        """Command the arm until asked to end, then decelerate; `on_ready` is called after the first cycle."""
         due, is_first = time.monotonic(), True
         while True:
             now = time.monotonic()
@@ -229,12 +229,12 @@ class CommandStream:
             is_first = False
 
     def fail(self) -> None:
-        """Publish that there is a fault."""
+        """Publish a fault."""
         self._phase = Phase.FAULT
         self._publish()
 
     def _look(self, now: float) -> None:
-        """Read the newest state and judge its age: by what the link's delay exceeds the usual one."""
+        """Read the newest state and estimate its age: the link's delay beyond the usual one."""
         robot_s = self._robot.receive.getTimestamp()
         if robot_s != self._robot_s:
             excess_s, known_s = self._delay.excess_s(robot_s, now), self._robot.age_s()
@@ -244,7 +244,7 @@ class CommandStream:
     def _check(self) -> None:
         receive, now = self._robot.receive, time.monotonic()
         if not receive.isConnected() or now - self._received_s > LOST_S:
-            raise RobotError("connection_lost: no state from the controller for 1 s: see its cable and its pendant")
+            raise RobotError("connection_lost: no state from the controller for 1 s: check its cable and its pendant")
         safety = receive.getSafetyMode()
         if safety not in SAFE_MODES:
             name = STOP_NAMES.get(safety, "safety_stop")
@@ -256,7 +256,7 @@ class CommandStream:
             )
 
     def _command(self, now: float) -> None:
-        """Send the next setpoint. A period that was missed is not made good: the arm would have to hurry."""
+        """Send the next setpoint. A missed period is not caught up, which would make the arm hurry."""
         dt, orders = self._dt, self._orders.read()
         self._limiter.limited[:] = False
         want, scale = self._wanted(orders, now, dt)
@@ -271,10 +271,10 @@ class CommandStream:
         if not is_taken or time.monotonic() - began > SLOW_CALL_S:
             self._look(time.monotonic())
             self._check()
-            raise RobotError("command_refused: the controller took no command, or took too long")
+            raise RobotError("command_refused: the controller refused a command, or took too long")
 
     def _wanted(self, orders: Any, now: float, dt: float) -> tuple[Vector, float]:
-        """Return the velocity that is wanted now and the share of the limits it may use; set the phase."""
+        """Return the wanted velocity and the share of the limits that it may use; set the phase."""
         order, number = Order(int(orders["order"])), float(orders["number"])
         limiter, standstill = self._limiter, np.zeros(6)
         fraction = min(max(self._robot.receive.getTargetSpeedFraction(), 0.0), 1.0)
@@ -305,7 +305,7 @@ class CommandStream:
         return limiter.velocity_towards(self._goal, self._goal_due_s - now, dt), fraction * self._blend
 
     def _change_hands(self, to_person: bool) -> Vector:
-        """Let a person lead the arm once it is at rest, or hold it again where it is."""
+        """Let a person lead the arm once it is at rest, or hold it again at its position."""
         if not to_person:
             self._robot.control.endTeachMode()
             self._limiter.restart(self._robot.receive.getActualQ())
@@ -342,27 +342,27 @@ class CommandStream:
 
 
 def main(argv: list[str]) -> None:
-    """Be the command stream of an arm; see this file's docstring."""
+    """Run the command stream of an arm; see this file's docstring."""
     settings = StreamSettings.from_json(argv[0])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal is the starter's to handle
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process handles Ctrl-C in the terminal
     output = os.dup(1)
     os.dup2(2, 1)  # ur_rtde writes to standard output
     stream = None
     try:
-        simulation = URSimulation(settings.ur_model, objects=())  # takes longer than the watchdog waits
+        simulation = URSimulation(settings.ur_model, objects=())  # it takes longer than the watchdog waits
         connection = connect(settings)
         try:
             stream = CommandStream(settings, connection, simulation)
             signal.signal(signal.SIGTERM, lambda *_: stream.is_asked_to_end.set())
             threading.Thread(target=_end_with_standard_input, args=(stream,), name="lifeline", daemon=True).start()
             stream.run(lambda: _say(output, READY))
-        except RobotError as error:  # said before anything waits for a connection that may be dead
+        except RobotError as error:  # reported before anything waits for a connection that may be dead
             if stream is not None:
                 stream.fail()
             _say(output, f"{FAILED}{error}")
             raise SystemExit(1) from None
         finally:
-            # ur_rtde waits without an end for a controller that is silent.
+            # ur_rtde waits indefinitely for a silent controller.
             threading.Thread(target=_end_soon, name="end", daemon=True).start()
             connection.close()
     except RobotError as error:

@@ -1,4 +1,4 @@
-"""Arms by their address: a simulated scene for `mujoco`, a real arm's mirror for `rtde://HOST`."""
+"""Arms by address: a simulated scene for `mujoco`, a real arm's mirror for `rtde://HOST`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def make_arm(
     metrics: str | None = None,
     **scene: Any,
 ) -> URSimulation:
-    """Return the arm and its scene; `scene` is `URSimulation`'s. Raises RobotError where there is none to be had."""
+    """Return the arm and its scene; `scene` is `URSimulation`'s. Raises RobotError if it cannot be reached."""
     host = host_of(robot)
     if host is None:
         return URSimulation(ur_model, **scene)

@@ -14,7 +14,7 @@ from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.robots.rtde_arm import RtdeArm
 from rlservo.envs.ur.parameters import JOINTS
 
-JOINT = JOINTS.index("wrist_3")  # turns the tool in place: of all joints the one that reaches nothing
+JOINT = JOINTS.index("wrist_3")  # turns the tool in place: the only joint whose motion cannot hit anything
 STEP = 0.05  # [rad], back and forth
 STEP_S = 0.4  # [s], for it
 NOTICED = 0.02  # [rad/s], a tenth of the motion's speed
@@ -28,13 +28,13 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LatencyReport:
-    """Latencies in ms, over `steps` steps, with what they mean for a policy at `control_rate_hz`."""
+    """Latencies in ms, over `steps` steps, with their meaning for a policy at `control_rate_hz`."""
 
     steps: int
     p50_ms: float
     p95_ms: float
     max_ms: float
-    jitter_ms: float  # p95 less p5
+    jitter_ms: float  # p95 minus p5
     state_period_ms: float  # between two states of the robot, median
     noise: float  # [rad], standard deviation of a joint at rest
     control_rate_hz: float
@@ -42,14 +42,14 @@ class LatencyReport:
 
     @property
     def disturbance(self) -> str:
-        """What `rlservo verify --disturb` takes: the worst latency in whole cycles, and real sensors' noise."""
+        """Argument of `rlservo verify --disturb`: the worst latency in whole cycles, and a real sensor's noise."""
         return f"latency={self.cycles},noise=real"
 
 
 def measure_latency(
     arm: RtdeArm, *, steps: int = 20, control_rate_hz: float = 10.0, on_step: Callable[[int], None] = lambda _: None
 ) -> LatencyReport:
-    """Move a wrist back and forth by 0.05 rad and time each start. Raises RobotError where nothing moves."""
+    """Move a wrist back and forth by 0.05 rad and time each start. Raises RobotError if nothing moves."""
     home = arm.arm_state().positions.copy()
     latencies_s: list[float] = []
     periods_s: list[float] = []
@@ -90,7 +90,7 @@ def measure_latency(
 
 
 def _first_motion(arm: RtdeArm, goal: Vector, began: float, periods_s: list[float]) -> float:
-    """Return when the first state with motion arrived [s of time.monotonic]."""
+    """Return the arrival time of the first state with motion [s of time.monotonic]."""
     before, given = arm.arm_state(), began
     while time.monotonic() - began < TIMEOUT_S:
         state = arm.arm_state()
@@ -105,4 +105,4 @@ def _first_motion(arm: RtdeArm, goal: Vector, began: float, periods_s: list[floa
             given = time.monotonic()
             arm.command(goal, max(began + STEP_S - given, AGAIN_S))
         time.sleep(LOOK_S)
-    raise RobotError(f"{JOINTS[JOINT]} did not move within {TIMEOUT_S:g} s of a command: see the speed slider")
+    raise RobotError(f"{JOINTS[JOINT]} did not move within {TIMEOUT_S:g} s of a command: check the speed slider")

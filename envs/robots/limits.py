@@ -1,8 +1,8 @@
-"""Limits of a real arm's motion, kept with braking distance: an arm near a limit slows down, it does not freeze.
+"""Limits of a real arm's motion, with braking distance: an arm near a limit slows down instead of freezing.
 
-Everything is in closed form, once a cycle of the command stream: what is wanted is a velocity, what comes out is the
-next joint setpoint. Limits of velocity, tool speed and workspace are met before the acceleration's, which then mixes
-the old velocity and the new: both keep those limits, and so does every mixture. Joint positions come last.
+Everything is in closed form, once per cycle of the command stream: from a wanted velocity to the next joint setpoint.
+Limits of velocity, tool speed and workspace are applied before that of acceleration, which mixes the old velocity and
+the new: both keep those limits, and so does every mixture. Joint positions come last.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from rlservo.envs.ur.simulation import URSimulation
 
 Vector = NDArray[np.float64]
 
-# What was limited, by element: the order of the counts.
+# Limited quantities, by element, in the order of the counts.
 COUNTED = (
     *(f"{kind}.{joint}" for kind in ("position", "velocity", "acceleration") for joint in JOINTS),
     "tool_speed", *(f"workspace.{axis}" for axis in "xyz"), "late_setpoint", "stale_observation",
 )  # fmt: skip
 POSITION, VELOCITY, ACCELERATION = (COUNTED.index(f"{kind}.base") for kind in ("position", "velocity", "acceleration"))
 TOOL_SPEED, WORKSPACE, LATE = (COUNTED.index(name) for name in ("tool_speed", "workspace.x", "late_setpoint"))
-PASSES = 2  # over the three axes: taking from one adds to another in a corner
-WALL_MARGIN = 0.03  # [m], by which walls stand further in: for the curvature that the closed form leaves out
-SHARE = 0.5  # of a tool axis' braking ability that a wall counts on: joints have other limits to keep meanwhile
+PASSES = 2  # over the three axes: in a corner, reducing one increases another
+WALL_MARGIN = 0.03  # [m], margin inside the walls, for the curvature that the closed form ignores
+SHARE = 0.5  # share of a tool axis' braking ability used for walls: joints have other limits to keep as well
 
 
 class CheckedLimits:
@@ -57,17 +57,17 @@ class CheckedLimits:
 
 @dataclass(frozen=True)
 class Limits(CheckedLimits):
-    """Limits of the command stream; the controller's own safety limits stand behind them."""
+    """Limits of the command stream, inside the controller's own safety limits."""
 
-    speed_scale: float = 1.0  # of all velocities below; a first run takes 0.1
+    speed_scale: float = 1.0  # of all velocities below; use 0.1 for a first run
     acceleration: float = 5.0  # [rad/s^2] of every joint, also to stop
     tool_speed: float = 0.5  # [m/s]
     box_low: tuple[float, ...] = (-2.0, -2.0, 0.0)  # [m], tool0 in base_link
     box_high: tuple[float, ...] = (2.0, 2.0, 2.0)  # [m]
     position_low: tuple[float, ...] = tuple(-limit for limit in POSITION_LIMITS)  # [rad]
     position_high: tuple[float, ...] = POSITION_LIMITS  # [rad]
-    start_speed: float = 0.3  # [rad/s], of the way to a start pose
-    blend_s: float = 1.0  # [s], in which the policy's share of the speed grows from 0 to 1
+    start_speed: float = 0.3  # [rad/s], on the way to a start pose
+    blend_s: float = 1.0  # [s] in which the policy's share of the speed grows from 0 to 1
     watchdog_hz: float = 10.0  # the controller ends the program after 1 / watchdog_hz without a command
     lookahead_s: float = 0.1  # [s], servoj's
     gain: float = 300.0  # servoj's
@@ -88,14 +88,14 @@ class Limits(CheckedLimits):
 
 
 def braking_speed(distance: Vector | float, deceleration: Vector | float, dt: float) -> Vector:
-    """Return the speed from which `distance` suffices to stop, one more cycle of `dt` [s] included."""
+    """Return the speed from which `distance` suffices to stop, including one more cycle of `dt` [s]."""
     reach = np.asarray(deceleration) * dt
     return np.sqrt(reach**2 + 2.0 * np.asarray(deceleration) * np.maximum(distance, 0.0)) - reach
 
 
 @dataclass
 class MotionLimiter:
-    """The joint setpoint of the command stream: position and velocity, moved on by `step`."""
+    """The joint setpoint of the command stream: position and velocity, advanced by `step`."""
 
     limits: Limits
     simulation: URSimulation  # for the tool's place and Jacobian
@@ -111,7 +111,7 @@ class MotionLimiter:
         self._box_low, self._box_high = self._box_low + WALL_MARGIN, self._box_high - WALL_MARGIN
 
     def restart(self, position: Sequence[float]) -> None:
-        """Stand at measured joint positions [rad] (6,)."""
+        """Restart at rest at measured joint positions [rad] (6,)."""
         self.position, self.velocity = np.array(position, dtype=np.float64), np.zeros(6)
 
     def goal_within(self, goal: Vector) -> Vector:
@@ -121,19 +121,19 @@ class MotionLimiter:
         return within
 
     def velocity_towards(self, goal: Vector, remaining_s: float, dt: float) -> Vector:
-        """Return the velocity that reaches `goal` in the time that remains, without running past it."""
+        """Return the velocity that reaches `goal` in the remaining time, without overshoot."""
         way = goal - self.position
         if remaining_s > dt:
             want = way / remaining_s
             self.limited[VELOCITY : VELOCITY + 6] |= np.abs(want) > self.velocity_limits * 1.001
-        else:  # it should be there: as fast as it may
+        else:  # it is overdue: as fast as allowed
             want = way * min(1.0 / dt, float((self.velocity_limits / np.maximum(np.abs(way), 1e-12)).min()))
         bound = braking_speed(np.abs(way), self.limits.acceleration, dt)
         clipped: Vector = np.clip(want, -bound, bound)
         return clipped
 
     def step(self, want: Vector, dt: float, scale: float) -> Vector:
-        """Move the setpoint on by `dt` [s], towards the velocity `want`, at most `scale` of the limits; return it."""
+        """Advance the setpoint by `dt` [s] towards the velocity `want`, within `scale` of the limits; return it."""
         velocity = want * min(1.0, float((self.velocity_limits / np.maximum(np.abs(want), 1e-12)).min())) * scale
         tool, jacobian = self.simulation.tool_at(self.position)
         velocity = self._within_box(velocity, tool, jacobian)
@@ -147,7 +147,7 @@ class MotionLimiter:
         if largest > most_change * 1.0001:
             if largest > 2.0 * most_change:
                 self.limited[ACCELERATION : ACCELERATION + 6] |= np.abs(change) > 2.0 * most_change
-            # In this mixture a wall may be braked for too little, where other joints change more: it has precedence.
+            # This mixture may brake too little for a wall if other joints change more: the wall has precedence.
             mixed = self._within_box(self.velocity + change * (most_change / largest), tool, jacobian)
             velocity = np.clip(mixed, self.velocity - most_change, self.velocity + most_change)
             velocity = np.clip(velocity, np.minimum(-most, self.velocity), np.maximum(most, self.velocity))
@@ -155,7 +155,7 @@ class MotionLimiter:
         lower = -braking_speed(self.position - self._low, self.limits.acceleration, self.longest_dt)
         bounded = np.clip(velocity, lower, upper)
         self.limited[POSITION : POSITION + 6] |= np.abs(bounded - velocity) > 1e-9
-        if not self._stops_within_box(bounded, tool, jacobian):  # a joint's limit took away what kept it within
+        if not self._stops_within_box(bounded, tool, jacobian):  # a joint's limit removed the part that kept it inside
             self.limited[WORKSPACE : WORKSPACE + 3] = True
             largest = float(np.abs(self.velocity).max())
             bounded = np.clip(self.velocity * max(0.0, 1.0 - most_change / max(largest, 1e-12)), lower, upper)
@@ -164,7 +164,7 @@ class MotionLimiter:
         return self.position
 
     def _within_box(self, velocity: Vector, tool: Vector, jacobian: Vector) -> Vector:
-        """Take from a velocity what would carry the tool through a wall; along the wall it goes on."""
+        """Remove from a velocity the part that would carry the tool through a wall; motion along the wall continues."""
         squares = np.maximum((jacobian**2).sum(axis=1), 1e-6)
         decelerations = SHARE * self.limits.acceleration * squares / np.maximum(np.abs(jacobian).max(axis=1), 1e-3)
         most = braking_speed(self._box_high - tool, decelerations, self.longest_dt)
@@ -183,7 +183,7 @@ class MotionLimiter:
         return velocity
 
     def _stops_within_box(self, velocity: Vector, tool: Vector, jacobian: Vector) -> bool:
-        """Return whether the tool would stop before each wall it moves to, all joints braking in proportion."""
+        """Return whether the tool would stop before each wall ahead, with all joints braking in proportion."""
         speeds = jacobian @ velocity
         way = speeds * (float(np.abs(velocity).max()) / (2.0 * self.limits.acceleration) + self.longest_dt)
         beyond = ((tool + way > self._box_high) & (speeds > 0.0)) | ((tool + way < self._box_low) & (speeds < 0.0))

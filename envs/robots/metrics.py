@@ -1,4 +1,4 @@
-"""Prometheus metrics of a real arm: its state, and the limits that were kept, by element."""
+"""Prometheus metrics of a real arm: its state, and the applied limits by element."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class ArmMetrics(Collector):
     def __init__(
         self, address: str, robot: str, *, counts: Callable[[], Mapping[str, int]], state: Callable[[], State]
     ) -> None:
-        """`address` is HOST:PORT to listen on. Raises RobotError where that cannot be had."""
+        """Listen on `address` (HOST:PORT). Raises RobotError if that fails."""
         self._robot, self._counts, self._state = robot, counts, state
         host, _, port = address.rpartition(":")
         if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-            raise RobotError(f"metrics {address!r}: expected HOST:PORT to listen on, '127.0.0.1:9108' say")
+            raise RobotError(f"metrics {address!r}: expected HOST:PORT to listen on, such as '127.0.0.1:9108'")
         registry = CollectorRegistry()
         registry.register(self)
         try:
@@ -31,15 +31,15 @@ class ArmMetrics(Collector):
             raise RobotError(f"metrics: cannot listen on {address}: {error}") from error
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the families as they are now."""
+        """Yield the current metric families."""
         kept = CounterMetricFamily(
-            "rlservo_robot_limited", "Cycles of a real arm's command stream in which a limit was kept",
+            "rlservo_robot_limited", "Cycles of a real arm's command stream in which a limit was applied",
             labels=["robot", "element"],
         )  # fmt: skip
         for element, count in self._counts().items():
             kept.add_metric([self._robot, element], count)
         yield kept
-        states = GaugeMetricFamily("rlservo_robot_state", "1 for the state it is in", labels=["robot", "state"])
+        states = GaugeMetricFamily("rlservo_robot_state", "1 for the present state", labels=["robot", "state"])
         for state in State:
             states.add_metric([self._robot, state.value], state == self._state())
         yield states

@@ -15,7 +15,7 @@ from rlservo.envs.robots.command_stream import Phase
 from rlservo.envs.robots.operator_terminal import Operator
 from rlservo.envs.robots.states import State, StateMachine
 
-FRESH_S = 6.0  # [s], for which a state that may be acted on is waited for; ur_rtde itself waits for 3 s
+FRESH_S = 6.0  # [s] to wait for a fresh state; ur_rtde itself waits for 3 s
 STALE_CYCLES = 2.0  # between an observation and the action for it
 LATE_CYCLES = 2.5  # between two commands
 LOOK_S = 0.002
@@ -66,7 +66,7 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
         self._connect, self._cycle_s, self._age_bound_s = connect, cycle_s, age_bound_s
         self._due_s = 0.0
         self._counts: dict[str, int] = {}
-        self._lost: dict[str, int] = {}  # counts of connections that are closed
+        self._lost: dict[str, int] = {}  # counts of closed connections
         self._robot = self._connected()
         self.state_seen = self._newest()
 
@@ -88,7 +88,7 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
             self._robot.hold()
 
     def advance(self, substeps: int = 0) -> None:  # noqa: ARG002  # a simulated base's
-        """Wait for the end of the control cycle and look at the robot."""
+        """Wait for the end of the control cycle and read the robot's state."""
         now = time.monotonic()
         self._due_s = max(self._due_s + self._cycle_s, now)  # a cycle that was missed is not caught up
         time.sleep(self._due_s - now)
@@ -96,7 +96,7 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
         self._follow_states()
 
     def robot_info(self) -> dict[str, Any] | None:
-        """Return the state, its changes and the limits that were kept, since the last call."""
+        """Return the state, its changes and the applied limits since the last call."""
         counts = self.limited()
         new = {name: count - self._counts.get(name, 0) for name, count in counts.items()}
         self._counts = counts
@@ -108,11 +108,11 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
         return info
 
     def take_over(self) -> None:
-        """Leave the robot to a person from the next control cycle on, or take it back."""
+        """Let a person lead the robot from the next control cycle on, or return it to the policy."""
         self.operator.toggle()
 
     def limited(self) -> dict[str, int]:
-        """Return how many commands each limit was kept in, by element, and stale actions."""
+        """Return the number of commands in which each limit was applied, by element, and of stale actions."""
         counts = dict(self._lost)
         for name, count in self._robot.limited().items():
             counts[name] = counts.get(name, 0) + count
@@ -155,14 +155,14 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
         return False
 
     def _look(self) -> None:
-        """Put the model where the robot is; wait, standing, for a state that may be acted on."""
+        """Set the model to the robot's state; hold and wait until it is fresh."""
         limit = time.monotonic() + FRESH_S
         state = self._newest()
         while _age_s(state) > self._age_bound_s and not self._note_fault():
             if time.monotonic() > limit:
                 self.stopped_by = "stale_observation"
                 self.hold()
-                why = f"the robot's newest state is {_age_s(state):.2f} s old, for {FRESH_S:g} s"
+                why = f"the robot's newest state is {_age_s(state):.2f} s old, after {FRESH_S:g} s"
                 self.states.enter(State.FAULT, why)
                 break
             time.sleep(LOOK_S)
@@ -187,7 +187,7 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
         return bool(fault)
 
     def _follow_states(self) -> None:
-        """Follow what the robot does and the person at the terminal."""
+        """Follow the robot's phase and the operator at the terminal."""
         if self._note_fault() or self.states.state == State.FAULT:
             return
         if self.operator.has_taken_over:

@@ -1,4 +1,4 @@
-"""The person at the terminal beside a real arm: asked before it moves to a start, and free to take it over with `h`."""
+"""Operator at the terminal of a real arm, who confirms moves to a start and can take the arm over with `h`."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ LOOK_S = 0.2
 
 
 class Operator:
-    """A person who confirms motions and takes the arm over. `toggle` may be called from any thread."""
+    """An operator who confirms motions and takes the arm over. `toggle` may be called from any thread."""
 
     def __init__(self, *, is_asked: bool) -> None:
-        """`is_asked`: whether a motion to a start waits for the person's yes."""
+        """Take `is_asked`: whether a motion to a start needs the operator's confirmation."""
         self._is_asked = is_asked
         self._has_taken_over = threading.Event()
         self._is_closed = threading.Event()
@@ -26,30 +26,30 @@ class Operator:
 
     @property
     def has_taken_over(self) -> bool:
-        """Whether the person leads the arm now."""
+        """Whether the operator leads the arm now."""
         return self._has_taken_over.is_set()
 
     def toggle(self) -> None:
-        """Take the arm over, or give it back."""
+        """Take the arm over, or return it to the policy."""
         if self._has_taken_over.is_set():
             self._has_taken_over.clear()
         else:
             self._has_taken_over.set()
 
     def confirm(self, question: str) -> None:
-        """Wait for a yes. Raises RobotError without one, and where there is no terminal to ask at."""
+        """Wait for a yes. Raises RobotError without one, or without a terminal."""
         if not self._is_asked:
             return
         if not sys.stdin.isatty():
-            raise RobotError(f"{question}: nobody can be asked without a terminal; --yes (confirm=False) says yes")
+            raise RobotError(f"{question}: there is no terminal for a confirmation; --yes (confirm=False) confirms")
         self._stop_keys()
-        sys.stderr.write(f"\n{question}. Is everybody out of its way, and a hand at the emergency stop? [y/N] ")
+        sys.stderr.write(f"\n{question}. Is everyone clear of the robot, and a hand on the emergency stop? [y/N] ")
         sys.stderr.flush()
         if sys.stdin.readline().strip().lower() not in ("y", "yes"):
             raise RobotError(f"{question}: not confirmed")
 
     def watch_keys(self) -> None:
-        """Let the key `h` take the arm over from now on, where there is a terminal."""
+        """Let the key `h` take the arm over from now on, if there is a terminal."""
         if self._keys is not None or not sys.stdin.isatty():
             return
         import termios
@@ -63,7 +63,7 @@ class Operator:
         self._keys.start()
 
     def close(self) -> None:
-        """Give the terminal back."""
+        """Restore the terminal."""
         self._stop_keys()
         atexit.unregister(self.close)
 

@@ -1,4 +1,4 @@
-"""A real UR arm: the command stream's process, seen from the process that has the policy."""
+"""A real UR arm: the policy's side of the command stream's process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SILENCE_S = 5.0  # [s] without a report, after which the process counts as dead
 REACHED = 0.01  # [rad]
 AT_REST = 0.01  # [rad/s]
 LOOK_S = 0.01
-LINE_S = 2.0  # [s], for the sentence of a fault that is known
+LINE_S = 2.0  # [s] to wait for the message of a known fault
 
 Vector = NDArray[np.float64]
 
@@ -41,9 +41,9 @@ class RtdeArm:
         setpoint_timeout_s: float = 0.25,
         limits: Limits | None = None,
     ) -> None:
-        """Connect and check the robot. Raises RobotError where it is another, not ready, or not to be reached.
+        """Connect and check the robot. Raises RobotError if it is a different one, not ready or unreachable.
 
-        `velocity_scale` is of the data sheet's velocities; after `setpoint_timeout_s` without a `command` it holds.
+        `velocity_scale` scales the data sheet's velocities; after `setpoint_timeout_s` without a `command` it holds.
         """
         self.host, self.limits = host, limits or Limits()
         orders, report = make_file(ORDERS), make_file(REPORT)
@@ -55,7 +55,7 @@ class RtdeArm:
             stdout=subprocess.PIPE,
             pass_fds=(orders, report),
             env={"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", **os.environ},
-            start_new_session=True,  # Ctrl-C in our terminal is ours to handle
+            start_new_session=True,  # this process handles Ctrl-C in the terminal
         )
         os.close(orders)
         os.close(report)
@@ -90,9 +90,9 @@ class RtdeArm:
         )
 
     def command(self, joint_positions: ArrayLike, duration_s: float = 0.5) -> None:
-        """Replace the setpoint: be at joint positions [rad] (6,) in `duration_s` [s], as far as limits allow.
+        """Replace the setpoint: reach joint positions [rad] (6,) in `duration_s` [s], as far as limits allow.
 
-        Raises ValueError for what is not finite.
+        Raises ValueError if they are not finite.
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         if goal.shape != (6,) or not np.isfinite(goal).all():
@@ -100,19 +100,19 @@ class RtdeArm:
         self._give(Order.FOLLOW, goal=goal, duration_s=duration_s)
 
     def hold(self) -> None:
-        """Decelerate and stand."""
+        """Decelerate and hold."""
         self._give(Order.HOLD)
 
     def free(self) -> None:
-        """Let a person lead the arm by hand, once it stands."""
+        """Let a person lead the arm by hand, once it is at rest."""
         self._give(Order.FREE)
 
     def blend_in(self, *, at_once: bool = False) -> None:
-        """Stand, and let the speed of the commands to come grow from 0, or be full `at_once`."""
+        """Hold, and let the speed of later commands grow from 0, or be full `at_once`."""
         self._give(Order.HOLD, blend_from_s=0.0 if at_once else time.monotonic())
 
     def go_to(self, joint_positions: ArrayLike) -> None:
-        """Move slowly to joint positions [rad] (6,) and wait until the arm stands there. Raises RobotError."""
+        """Move slowly to joint positions [rad] (6,) and wait until the arm is at rest there. Raises RobotError."""
         goal = np.asarray(joint_positions, dtype=np.float64)
         self._give(Order.GO, goal=goal)
         slowest = self.limits.start_speed * self.limits.speed_scale
@@ -122,22 +122,22 @@ class RtdeArm:
             if np.abs(state.positions - goal).max() < REACHED and np.abs(state.velocities).max() < AT_REST:
                 break
             if fault := self.fault:
-                raise RobotError(f"on the way to its start the robot stopped: {fault}")
+                raise RobotError(f"the robot stopped on the way to its start: {fault}")
             if time.monotonic() > limit:
                 away = float(np.abs(state.positions - goal).max())
                 self.hold()
                 raise RobotError(
-                    f"the robot does not reach its start, a joint is {away:.3f} rad away: see the speed slider, and "
-                    "whether limits are in the way"
+                    f"the robot did not reach its start: a joint is {away:.3f} rad away; check the speed slider and "
+                    "the limits"
                 )
             time.sleep(LOOK_S)
         self.hold()
 
-    # -- what the stream tells
+    # -- the stream's reports
 
     @property
     def phase(self) -> Phase:
-        """What the stream does."""
+        """The stream's activity."""
         return Phase(int(self._report.read()["phase"]))
 
     @property
@@ -151,23 +151,23 @@ class RtdeArm:
         return setpoint
 
     def limited(self) -> dict[str, int]:
-        """Return how many cycles of the stream each limit was kept in, by element; what never happened is left out."""
+        """Return the number of cycles in which each limit was applied, by element, without zeros."""
         counts = self._report.read()["limited"]
         return {name: int(count) for name, count in zip(COUNTED, counts, strict=True) if count}
 
     @property
     def fault(self) -> str:
-        """Why the arm does not take commands any more; empty where it does."""
+        """The reason why the arm no longer accepts commands; empty if it does."""
         if not self._fault:
             if self._process.poll() is not None or self.phase == Phase.FAULT:
                 line = self._read_line(LINE_S)
                 self._fault = line.removeprefix(FAILED) or "stream_ended: the command stream's process was killed"
             elif time.monotonic() - float(self._report.read()["written_s"]) > SILENCE_S:
-                self._fault = "stream_silent: the command stream's process does not run"
+                self._fault = "stream_silent: the command stream's process does not respond"
         return self._fault
 
     def close(self) -> None:
-        """Stop the arm and end the process; where that hangs, kill it, and the watchdog stops the arm."""
+        """Stop the arm and end the process; if that hangs, kill it, and the watchdog stops the arm."""
         assert self._process.stdin is not None and self._process.stdout is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
@@ -183,7 +183,7 @@ class RtdeArm:
         self._orders.write({"order": order, "given_s": time.monotonic(), "number": self._number, **values})
 
     def _read_line(self, timeout_s: float) -> str:
-        """Return the process's next line; empty where it ended without one, or nothing came in time."""
+        """Return the process's next line; empty if it ended without one, or nothing came in time."""
         assert self._process.stdout is not None
         pipe, output, limit = self._process.stdout.fileno(), b"", time.monotonic() + timeout_s
         with selectors.DefaultSelector() as selector:

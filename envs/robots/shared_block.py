@@ -1,4 +1,4 @@
-"""A record that one process writes and another reads, without either ever waiting for the other."""
+"""A record that one process writes and another reads, without waiting for each other."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ TRIES = 1000
 
 
 def make_file(layout: np.dtype[Any]) -> int:
-    """Return the descriptor of memory for a record; it goes with its last process."""
+    """Return a descriptor of memory for a record; it is freed with its last process."""
     descriptor = os.memfd_create("rlservo-arm", 0)
     os.ftruncate(descriptor, 8 + layout.itemsize)
     return descriptor
 
 
 class SharedBlock:
-    """A record with one writer. A reader sees all of one write or all of another.
+    """A record with one writer. A reader always sees one complete write.
 
-    A counter stands before it: odd while it is being written. x86 keeps the order of stores.
+    A counter precedes it, odd while the record is being written. x86 preserves the order of stores.
     """
 
     def __init__(self, descriptor: int, layout: np.dtype[Any]) -> None:
@@ -30,14 +30,14 @@ class SharedBlock:
         self._record = np.frombuffer(memory, layout, 1, offset=8)
 
     def write(self, values: dict[str, Any]) -> None:
-        """Replace fields of the record. One process alone may."""
+        """Replace fields of the record. Only one process may write."""
         self._counter[0] += 1.0
         for name, value in values.items():
             self._record[name][0] = value
         self._counter[0] += 1.0
 
     def read(self) -> Any:
-        """Return a copy of the newest record (its fields by name); where the writer died, what it had written."""
+        """Return a copy of the newest record (its fields by name); if the writer died, its partial write."""
         record = self._record.copy()
         for _ in range(TRIES):
             before = self._counter[0]

@@ -11,7 +11,7 @@ log = logging.getLogger("rlservo.robot")
 
 
 class State(str, Enum):
-    """What the arm is about."""
+    """State of the control of an arm."""
 
     CONNECT = "connect"
     CHECK = "check"
@@ -38,7 +38,7 @@ FOLLOWS: dict[State, set[State]] = {
     State.STOP: {State.CONNECT},
     State.FAULT: {State.CONNECT},
 }
-"""Which state may follow; every state may end in STOP or FAULT."""
+"""Allowed next states; every state may end in STOP or FAULT."""
 
 
 class Change(NamedTuple):
@@ -50,18 +50,18 @@ class Change(NamedTuple):
 
 
 class StateMachine:
-    """The state and its changes: a log line each, and what a recording is given."""
+    """The state and its changes, each logged and kept for a recording."""
 
     def __init__(self) -> None:
         self.state = State.CONNECT
         self.changes: list[Change] = []
 
     def enter(self, state: State, why: str = "") -> None:
-        """Change the state; nothing to do where it is that already."""
+        """Change the state; does nothing if it is already in that state."""
         if state == self.state:
             return
         allowed = FOLLOWS[self.state] | {State.STOP, State.FAULT}
-        assert state in allowed, f"{state.value} does not follow {self.state.value}"
+        assert state in allowed, f"state {state.value} cannot follow {self.state.value}"
         before, self.state = self.state, state
         level = logging.WARNING if state in (State.FAULT, State.HUMAN) else logging.INFO
         log.log(level, "robot: %s -> %s%s", before.value, state.value, f": {why}" if why else "")

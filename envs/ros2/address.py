@@ -16,10 +16,10 @@ CHOICES = {
 }
 # Topics of Universal_Robots_ROS2_Driver; `commands` follows from `command`.
 ARM_OPTIONS = {
-    "prefix": "",  # before the joints' names
+    "prefix": "",  # prefix of the joint names
     "command": "position",
     "commands": "",
-    "status": "on",  # off: a robot without speed scaling, modes and program
+    "status": "on",  # off: a robot without speed scaling, modes and program state
     "clock": "ros",
     "joint_states": "/joint_states",
     "speed_scaling": "/speed_scaling_state_broadcaster/speed_scaling",
@@ -36,7 +36,7 @@ BASE_OPTIONS = {
     "odom": "/odom",
     "cmd_vel": "/cmd_vel",
     "twist": "auto",
-    "scan": "",  # empty: both scanners' own topics where they are published, else /scan
+    "scan": "",  # empty: both scanners' own topics if they are published, else /scan
     "front_scan": "/f_scan",
     "back_scan": "/b_scan",
     "deadman": "",  # a std_msgs/Bool that must be true and fresh while the base moves
@@ -46,9 +46,9 @@ BASE_OPTIONS = {
 
 @dataclass(frozen=True)
 class RosAddress:
-    """Where a robot's topics are, and their names."""
+    """A robot's graph or rosbridge, and its topic names."""
 
-    host: str = ""  # of a rosbridge; empty: ROS 2 itself
+    host: str = ""  # rosbridge; empty: ROS 2 itself
     port: int = ROSBRIDGE_PORT
     options: Mapping[str, str] = field(default_factory=dict)
 
@@ -57,7 +57,7 @@ class RosAddress:
 
     @classmethod
     def parse(cls, robot: str, defaults: Mapping[str, str]) -> RosAddress:
-        """Return the parts of an address. Raises RobotError for an option or a value that does not exist."""
+        """Parse an address. Raises RobotError for an unknown option or value."""
         place, *settings = robot.split(",")
         options = dict(defaults)
         host, port = "", ROSBRIDGE_PORT
@@ -73,7 +73,7 @@ class RosAddress:
         for setting in settings:
             name, equals, value = setting.partition("=")
             if not equals or name not in options:
-                raise RobotError(f"robot {robot!r}: {setting!r} is none of {', '.join(options)} with =VALUE")
+                raise RobotError(f"robot {robot!r}: {setting!r} is not one of {', '.join(options)} with =VALUE")
             if name in CHOICES and value not in CHOICES[name]:
                 raise RobotError(f"robot {robot!r}: {name} is {value!r}, expected {' or '.join(CHOICES[name])}")
             options[name] = value

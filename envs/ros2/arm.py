@@ -1,4 +1,4 @@
-"""A UR arm behind ROS 2, as the command stream sees it: Universal_Robots_ROS2_Driver's topics."""
+"""A UR arm behind ROS 2, for the command stream: topics of Universal_Robots_ROS2_Driver."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from rlservo.envs.ros2.messages import (
 if TYPE_CHECKING:
     from rlservo.envs.robots.command_stream import StreamSettings
 
-RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of commands, where the limits name none
+RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of commands, if the limits name none
 RUNNING = 7
-# Distance of a joint from its setpoint beyond which it does not follow: at rest, and so much of its velocity more.
+# Distance of a joint from its setpoint beyond which it does not follow: at rest, plus this much of its velocity.
 FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
-AHEAD_S = 0.1  # of a trajectory's point: its controller begins each new one where the arm is, which lags
+AHEAD_S = 0.1  # of a trajectory's point: the controller begins each new one at the arm's lagging position
 DRIFT_GAIN = 2.0  # [1/s], of velocity commands
 KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTORY}
 
@@ -42,13 +42,13 @@ Vector = NDArray[np.float64]
 
 
 class RosArmConnection:
-    """The arm's topics, under the names of ur_rtde's methods that the command stream calls."""
+    """The arm's topics, with the ur_rtde methods that the command stream calls."""
 
     def __init__(self, settings: StreamSettings) -> None:
         """Wait for every input, then take the command topic. Raises RobotError."""
         self._address = address = RosAddress.parse(settings.host, ARM_OPTIONS)
         if address.host:
-            raise RobotError(f"robot {settings.host!r}: an arm is reached by ros2: or rtde://, not by a rosbridge")
+            raise RobotError(f"robot {settings.host!r}: an arm needs ros2: or rtde://, not a rosbridge")
         self._how = address["command"]
         self._limits = settings.limits
         self.rate_hz = settings.limits.rate_hz or RATE_HZ[self._how]
@@ -60,40 +60,40 @@ class RosArmConnection:
         self._speed_percent = 100.0 if address["status"] == "off" else float("nan")
         self._modes: dict[str, int] = {"program_running": 1, "robot_mode": RUNNING, "safety_mode": 1}
         self._setpoint: Vector | None = None
-        self._fastest = 0.0  # [rad/s], of the setpoints of the last moments
+        self._fastest = 0.0  # [rad/s], of the latest setpoints
         self._guard: subprocess.Popen[bytes] | None = None
         self._link = open_link(address, "rlservo_arm")
         try:
             self._subscribe()
             topic = address["commands"] or COMMAND_TOPICS[self._how]
-            if self._how == "velocity":  # its controller repeats the last command without an end
+            if self._how == "velocity":  # its controller repeats the last command indefinitely
                 words = [sys.executable, "-m", "rlservo.envs.ros2.velocity_guard", topic]
                 self._guard = subprocess.Popen(
                     words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
                 )
             self._publish = take_command(self._link, topic, KINDS[self._how])
             if self._guard is not None and self._guard.stdout is not None and not self._guard.stdout.readline():
-                raise RobotError(f"the guard of {topic} ended before it could guard: nothing is commanded without it")
+                raise RobotError(f"the guard of {topic} ended at its start: nothing is commanded without it")
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Leave the graph; the guard of velocity commands ends with its input, after a last zero."""
+        """Leave the graph; the guard of velocity commands ends with its input, after a final zero."""
         self._link.close()
         if self._guard is not None and self._guard.stdin is not None:
             self._guard.stdin.close()
             self._guard.wait()
 
     def age_s(self) -> float | None:
-        """Return how old the newest state was when it came [s], by its stamp; None where the clock is the robot's."""
+        """Return the newest state's age at its arrival [s], by its stamp; None with the robot's own clock."""
         assert self._state is not None
         return self._state[1]
 
     # -- receive
 
     def isConnected(self) -> bool:
-        """Return True: the age of the states says more."""
+        """Return True: the age of the states is the better sign."""
         return True
 
     def getTimestamp(self) -> float:
@@ -114,11 +114,11 @@ class RosArmConnection:
         return [float(value) for value in self._state[3]]
 
     def getRobotMode(self) -> int:
-        """Return the robot mode, 7 where it runs."""
+        """Return the robot mode, 7 if it runs."""
         return self._modes["robot_mode"]
 
     def getSafetyMode(self) -> int:
-        """Return the safety mode, 1 where it is normal."""
+        """Return the safety mode, 1 if it is normal."""
         return self._modes["safety_mode"]
 
     def getRobotStatus(self) -> int:
@@ -132,7 +132,7 @@ class RosArmConnection:
     # -- control
 
     def servoJ(self, setpoint: Sequence[float], *_: float) -> bool:
-        """Publish the next setpoint [rad] (6,); return False where the arm does not follow."""
+        """Publish the next setpoint [rad] (6,); return False if the arm does not follow."""
         goal, measured = np.array(setpoint), np.array(self.getActualQ())
         before = goal if self._setpoint is None else self._setpoint
         velocity = (goal - before) * self.rate_hz
@@ -162,7 +162,7 @@ class RosArmConnection:
             self._guard.stdin.flush()
 
     def servoStop(self) -> None:
-        """Send nothing more: the arm stands, and another node may lead it."""
+        """Stop sending: the arm holds, and another node may command it."""
         self._setpoint = None
 
     teachMode = servoStop
@@ -171,7 +171,7 @@ class RosArmConnection:
     # -- parts
 
     def _trajectory(self, goal: Vector, velocity: Vector) -> dict[str, Any]:
-        """Return two points: the setpoint, and from there a stop, which is the end if no other trajectory comes."""
+        """Return two points: the setpoint, and then a stop, the end if no other trajectory comes."""
         stop_s = float(np.abs(velocity).max()) / self._limits.acceleration
         points: list[tuple[float, Vector, Vector]] = [(AHEAD_S, goal + velocity * AHEAD_S, velocity)]
         if stop_s > 0.0:
@@ -189,11 +189,10 @@ class RosArmConnection:
                 topic = address[name]
                 wait_until(
                     lambda topic=topic: bool(link.publishers(topic)),  # type: ignore[misc]  # a default is no argument
-                    f"nothing publishes {topic}: is the driver's io_and_status_controller active (status=off goes "
-                    "without)",
+                    f"nothing publishes {topic}: is the driver's io_and_status_controller active (or use status=off)",
                     FIRST_MESSAGES_S,
                 )
-                # ur_dashboard_msgs' own type, or a plain number where that package is not installed.
+                # ur_dashboard_msgs' own type, or a plain number if that package is not installed.
                 kind = own or link.publishers(topic)[0].type or INT8
                 link.subscribe(topic, kind, lambda message, name=name: self._take_mode(name, message), is_kept=True)  # type: ignore[misc]
         wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
@@ -207,7 +206,7 @@ class RosArmConnection:
             return self._problem
         missing = [name for name in ("program_running", "robot_mode", "safety_mode") if name not in self._modes]
         topics = [self._address[name] for name in missing or ["speed_scaling"]]
-        return f"no message on {', '.join(topics)} (status=off goes without)"
+        return f"no message on {', '.join(topics)} (status=off works without it)"
 
     def _take_state(self, message: Any) -> None:
         positions = in_order(message, self._joints, "position")
@@ -215,7 +214,7 @@ class RosArmConnection:
         made_s = stamp_of(message)
         if positions is None or velocities is None:
             names = ", ".join(message.name)
-            self._problem = f"{self._address['joint_states']} lacks some of {', '.join(self._joints)}: it has {names}"
+            self._problem = f"{self._address['joint_states']} lacks joints of {', '.join(self._joints)}: it has {names}"
         elif made_s is None:
             self._problem = f"{self._address['joint_states']} has no stamps: its driver must set them"
         elif self._state is None or made_s > self._state[0]:

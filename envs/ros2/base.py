@@ -1,7 +1,7 @@
-"""A mobile base behind ROS: its state in, velocities within limits out, at 20 Hz from a thread of its own.
+"""A mobile base behind ROS: state in, velocities within limits out, at 20 Hz from its own thread.
 
-The thread ends with its process. Then the base's own time-out of velocity commands stops it (diff_drive_controller and
-the MiR100: 0.5 s), as it does where the network fails.
+If its process dies, the base's own time-out of velocity commands stops it (diff_drive_controller and the MiR100: 0.5
+s), as it does if the network fails.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ from rlservo.envs.ros2.messages import (
 )
 
 RATE_HZ = 20.0
-AGE_BOUND_S = 0.3  # [s] of what may be acted on: scans come at 12.5 Hz, or 10
+AGE_BOUND_S = 0.3  # [s] oldest input that may be acted on: scans come at 12.5 Hz, or 10
 LOST_S = 2.0  # [s] without odometry, after which the connection counts as lost
-DEADMAN_S = 0.5  # [s], of a dead-man's message
-SCALES = (1.0, 0.75, 0.5, 0.25)  # of a velocity, tried one after the other where something is in the way
-INSTANTS = 5  # of the way to a standstill that are looked at
+DEADMAN_S = 0.5  # [s], oldest dead-man message
+SCALES = (1.0, 0.75, 0.5, 0.25)  # of a velocity, tried in order if something is in the way
+INSTANTS = 5  # points checked on the path to a standstill
 
 Vector = NDArray[np.float64]
 Twist2 = tuple[float, float]  # [m/s], [rad/s]
@@ -60,13 +60,13 @@ Twist2 = tuple[float, float]  # [m/s], [rad/s]
 
 @dataclass(frozen=True)
 class BaseLimits(CheckedLimits):
-    """Limits of a base's motion; its own safety scanners stand behind them."""
+    """Limits of a base's motion, inside those of its own safety scanners."""
 
-    speed_scale: float = 1.0  # of both velocities; a first run takes 0.2
+    speed_scale: float = 1.0  # of both velocities; use 0.2 for a first run
     acceleration: float = 1.5  # [m/s^2], also to stop
     angular_acceleration: float = MAX_ANGULAR_ACCELERATION  # [rad/s^2]
-    stop_distance: float = 0.1  # [m], of the body from what a scan sees; 0: no look at the scan
-    blend_s: float = 0.5  # [s], in which the policy's share of the speed grows from 0 to 1
+    stop_distance: float = 0.1  # [m], between the body and a scan's points; 0: the scan is not used
+    blend_s: float = 0.5  # [s] in which the policy's share of the speed grows from 0 to 1
 
     RANGES: ClassVar[dict[str, tuple[float, float]]] = {
         "speed_scale": (0.01, 1.0), "acceleration": (0.1, 2.0), "angular_acceleration": (0.1, 2.5),
@@ -75,13 +75,13 @@ class BaseLimits(CheckedLimits):
 
 
 class BaseState(NamedTuple):
-    """A base at a moment."""
+    """State of a base at one moment."""
 
     pose: tuple[float, float, float]  # [m], [m], [rad], of base_link in the odometry's frame
     velocity: Twist2
     readings: Vector | None  # [m], (1012,), of the MiR100's scanners; None without a scan
-    received_s: float  # time.monotonic() of the oldest message in it
-    age_s: float  # how old that message was then
+    received_s: float  # time.monotonic() at the arrival of its oldest message
+    age_s: float  # that message's age then
 
 
 class _Input:
@@ -94,7 +94,7 @@ class _Input:
         self._delay = LinkDelay()
 
     def take(self, message: Any, value: Any) -> None:
-        """Take a message in, unless it is older than the last one."""
+        """Take a message, unless it is older than the last one."""
         made_s, now = stamp_of(message), time.monotonic()
         if value is None or made_s is None or made_s <= self._made_s:
             return
@@ -103,12 +103,12 @@ class _Input:
         self.age_s = self._delay.excess_s(made_s, now_s) if self._has_own_clock else abs(now_s - made_s)
 
     def age(self) -> float:
-        """Return how old the newest message is now [s]."""
+        """Return the newest message's present age [s]."""
         return math.inf if self.value is None else time.monotonic() - self.received_s + self.age_s
 
 
 class RosBase:
-    """A base that is commanded velocities. `close` stops it and leaves the graph."""
+    """A base that is commanded by velocities. `close` stops it and leaves the graph."""
 
     def __init__(
         self, robot: str, *, limits: BaseLimits | None = None, setpoint_timeout_s: float = 0.25, needs_scan: bool = True
@@ -164,19 +164,19 @@ class RosBase:
         self._setpoint, self._order = (time.monotonic(), (linear, angular)), Order.FOLLOW
 
     def hold(self) -> None:
-        """Decelerate and stand."""
+        """Decelerate and hold."""
         self._order = Order.HOLD
 
     def free(self) -> None:
-        """Publish nothing any more, so that a person may drive."""
+        """Stop publishing, so that a person may drive."""
         self._order = Order.FREE
 
     def blend_in(self) -> None:
-        """Stand, and let the speed of the commands to come grow from 0."""
+        """Hold, and let the speed of later commands grow from 0."""
         self._order, self._blend_from_s = Order.HOLD, time.monotonic()
 
     def limited(self) -> dict[str, int]:
-        """Return in how many commands each limit was kept."""
+        """Return the number of commands in which each limit was applied."""
         return {name: count for name, count in self._counts.items() if count}
 
     def close(self) -> None:
@@ -189,7 +189,7 @@ class RosBase:
     # -- inputs
 
     def _scan_topics(self) -> dict[str, tuple[float, float, float]]:
-        """Return the scans' topics and where they are in base_link [m], [m], [rad]."""
+        """Return the scans' topics and their poses in base_link [m], [m], [rad]."""
         address = self.address
         both = {
             address["front_scan"]: scanner_pose(FRONT_SCANNER),
@@ -206,7 +206,7 @@ class RosBase:
             return bool(found)
 
         names = address["scan"] or f"{' and '.join(both)}, or /scan"
-        wait_until(look, f"nothing publishes {names} (limits stop_distance=0 goes without)", FIRST_MESSAGES_S)
+        wait_until(look, f"nothing publishes {names} (limit stop_distance=0 works without it)", FIRST_MESSAGES_S)
         return found
 
     def _subscribe_scan(self, topic: str, pose: tuple[float, float, float]) -> None:
@@ -224,7 +224,7 @@ class RosBase:
         return f"no message with a stamp on {', '.join(missing)}: is the base's driver running"
 
     def _find_twist(self) -> str:
-        """Return the message type of the command topic: as said, or as its subscribers have it."""
+        """Return the message type of the command topic: as set, or as its subscribers use it."""
         said = self.address["twist"]
         if said != "auto":
             return TWIST_STAMPED if said == "TwistStamped" else TWIST
@@ -239,7 +239,7 @@ class RosBase:
         kinds = {one.type for one in found} & {TWIST, TWIST_STAMPED}
         if len(kinds) != 1:
             types = ", ".join(sorted({one.type for one in found}))
-            raise RobotError(f"{topic} is subscribed to as {types}: say twist=Twist or twist=TwistStamped")
+            raise RobotError(f"{topic} has subscribers of the types {types}: set twist=Twist or twist=TwistStamped")
         return kinds.pop()
 
     def _points(self) -> Vector:
@@ -259,7 +259,7 @@ class RosBase:
             time.sleep(max(0.0, due - time.monotonic()))
 
     def _next(self) -> Twist2:
-        """Return the velocities of the next command: what is wanted, within the limits; set the phase."""
+        """Return the velocities of the next command, within the limits; set the phase."""
         want, dt, limits = self._wanted(), 1.0 / RATE_HZ, self.limits
         if self.phase == Phase.FREE:
             return 0.0, 0.0
@@ -314,7 +314,7 @@ class RosBase:
         self.phase = phase
 
     def _is_clear(self, linear: float, angular: float) -> bool:
-        """Return whether the body keeps its distance to a standstill, or at least comes no nearer to what is near."""
+        """Return whether the body keeps its distance until standstill, or at least comes no nearer to close points."""
         points = self._points()
         if not self.limits.stop_distance or not len(points) or not (linear or angular):
             return True
@@ -325,7 +325,7 @@ class RosBase:
         near = before < self.limits.stop_distance + stop_s * (abs(linear) + LENGTH * abs(angular))
         points, before = points[near], before[near]
         for share in np.linspace(1.0 / INSTANTS, 1.0, INSTANTS).tolist():
-            time_s = share * stop_s * (1.0 - share / 2.0)  # while it decelerates it goes half as far in the end
+            time_s = share * stop_s * (1.0 - share / 2.0)  # decelerating, it covers half of that distance
             yaw = angular * time_s
             x = linear * time_s * math.cos(yaw / 2.0)
             y = linear * time_s * math.sin(yaw / 2.0)
@@ -336,7 +336,7 @@ class RosBase:
 
 
 def _distances(points: Vector, x: float, y: float, yaw: float) -> Vector:
-    """Return each point's distance [m] from the body of a base that stands at a pose, negative inside."""
+    """Return each point's distance [m] from the body of a base at a pose, negative inside."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     dx, dy = points[:, 0] - x, points[:, 1] - y
     ahead = np.abs(cos * dx + sin * dy - BODY_CENTRE[0]) - LENGTH / 2.0

@@ -1,4 +1,4 @@
-"""Link to a ROS graph: what the backends, the node and the simulators ask of rclpy or a rosbridge."""
+"""Link to a ROS graph: the interface to rclpy or a rosbridge for the backends, the node and the simulators."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CLOCK_TOLERANCE_S = 5.0  # older than this at the first message: the clocks diff
 LOOK_S = 0.02
 # In which every node of the graph is discovered: Fast DDS repeats its announcements every 3 s, and one may be lost.
 DISCOVERY_S = 4.0
-LEAVING_S = 1.0  # in which a node that ends is gone from the graph, or the name of a new one is known
+LEAVING_S = 1.0  # until an ended node has left the graph, or a new one's name is known
 
 Publish = Callable[[Mapping[str, Any]], None]
 log = logging.getLogger("rlservo.robot")
@@ -30,18 +30,18 @@ class Endpoint(NamedTuple):
 
 
 class Topics(Protocol):
-    """A place for messages. Callbacks come in a thread of its own, one at a time."""
+    """Topics of a graph. Callbacks run in a thread of their own, one at a time."""
 
     def now_s(self) -> float:
         """Return ROS's time [s]."""
         ...
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
-        """Call `on_message` with each new message; `is_kept`: also with the last one before, where it is kept."""
+        """Call `on_message` with each new message; `is_kept`: also with the last earlier one, if kept."""
         ...
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
-        """Return a function that publishes a message, given as a dictionary."""
+        """Return a function that publishes a message given as a dictionary."""
         ...
 
     def close(self) -> None:
@@ -57,7 +57,7 @@ class Link(Topics, Protocol):
         ...
 
     def rivals(self, topic: str) -> list[Endpoint]:
-        """Return those publishers that command what the topic commands."""
+        """Return the publishers that compete for the topic."""
         ...
 
     def subscribers(self, topic: str) -> list[Endpoint]:
@@ -66,7 +66,7 @@ class Link(Topics, Protocol):
 
 
 def open_link(address: RosAddress, name: str) -> Link:
-    """Return the link that an address asks for. Raises RobotError where there is no rclpy, or no rosbridge answers."""
+    """Return the link for an address. Raises RobotError without rclpy, or if no rosbridge answers."""
     if address.host:
         from rlservo.envs.ros2.rosbridge_link import RosbridgeLink
 
@@ -77,7 +77,7 @@ def open_link(address: RosAddress, name: str) -> Link:
 
 
 def wait_until(condition: Callable[[], bool], what: Callable[[], str] | str, timeout_s: float) -> None:
-    """Wait for a condition, and say after 10 s for what. Raises RobotError when it does not come true in time."""
+    """Wait for a condition, and report it after 10 s. Raises RobotError when it does not come true in time."""
     began, said = time.monotonic(), False
     while not condition():
         waited_s = time.monotonic() - began
@@ -97,7 +97,7 @@ def check_clock(topic: str, age_s: float) -> None:
 
 
 def take_command(link: Link, topic: str, kind: str) -> Publish:
-    """Advertise a command topic that no other node may publish on. Raises RobotError naming one that does."""
+    """Advertise a command topic exclusively. Raises RobotError, which names a node that publishes on it already."""
 
     def refuse() -> None:
         if not link.rivals(topic):
@@ -105,7 +105,7 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
         time.sleep(LEAVING_S)
         if others := link.rivals(topic):
             names = ", ".join(sorted({one.node for one in others}))
-            raise RobotError(f"{topic} is commanded by {names} already: end it first, a robot obeys one node")
+            raise RobotError(f"{topic} is already commanded by {names}: end it first, as a robot obeys one node")
 
     def is_listened_to() -> bool:
         refuse()
@@ -119,7 +119,7 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
             raise RobotError(f"{topic} takes {', '.join(sorted(types))}, not {kind}: name another topic") from None
         raise
     publish = link.advertise(topic, kind)
-    # Of two that come at once each sees the other, and neither commands.
+    # If two start at once, each sees the other, and neither commands.
     until = time.monotonic() + DISCOVERY_S
     while time.monotonic() < until:
         refuse()
@@ -128,12 +128,12 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
 
 
 def safely(on_message: Callable[[Any], None], topic: str) -> Callable[[Any], None]:
-    """Return a callback that a message of another form ends neither with its thread nor with what it drives."""
+    """Return a callback that survives malformed messages: neither its thread nor the robot's control ends."""
 
     def take(message: Any) -> None:
         try:
             on_message(message)
-        except Exception as error:  # anybody's message
+        except Exception as error:  # a message from any node
             log.warning("a message on %s cannot be understood: %s: %s", topic, type(error).__name__, error)
 
     return take

@@ -1,7 +1,7 @@
-"""Conversions between ROS messages and numbers, the same for the node, the backends and the simulators.
+"""Conversions between ROS messages and numbers, shared by the node, the backends and the simulators.
 
-A message that arrives has attributes: it is rclpy's own, or a rosbridge's JSON as `parse` makes it. A message that
-leaves is a dictionary, which a link turns into either.
+An incoming message has attributes: it is rclpy's own, or a rosbridge's JSON after `parse`. An outgoing message is a
+dictionary, which a link converts to either.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ NUMBERS, NUMBER, FLAG = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float64"
 INT8 = "std_msgs/msg/Int8"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
-# By our own names, in kinematic order.
+# ROS names by our own, in kinematic order.
 JOINT_NAMES = {
     "base": "shoulder_pan_joint", "shoulder": "shoulder_lift_joint", "elbow": "elbow_joint",
     "wrist_1": "wrist_1_joint", "wrist_2": "wrist_2_joint", "wrist_3": "wrist_3_joint",
 }  # fmt: skip
-GAP = 3  # beams of a scanner that may be between two points of one surface
+GAP = 3  # beams of a scanner that may lie between two points of one surface
 
 Vector = NDArray[np.float64]
 
 
 def parse(value: Any) -> Any:
-    """Return a rosbridge's JSON with attributes in the place of keys."""
+    """Return a rosbridge's JSON with attributes in place of keys."""
     if isinstance(value, Mapping):
         return SimpleNamespace(**{name: parse(one) for name, one in value.items()})
     if isinstance(value, list) and value and isinstance(value[0], Mapping):
@@ -47,13 +47,13 @@ def parse(value: Any) -> Any:
 
 
 def stamp(time_s: float) -> dict[str, int]:
-    """Return a time [s] as ROS 2 writes it."""
+    """Return a time [s] in ROS 2's form."""
     whole = math.floor(time_s)
     return {"sec": whole, "nanosec": min(999_999_999, round((time_s - whole) * 1e9))}
 
 
 def stamp_of(message: Any) -> float | None:
-    """Return when a message was made [s], by its header (ROS 1's or 2's); None where it has none, or it is zero."""
+    """Return a message's time [s] from its header (ROS 1 or 2); None if it is missing or zero."""
     made = getattr(getattr(message, "header", None), "stamp", None)
     if made is None:
         return None
@@ -64,7 +64,7 @@ def stamp_of(message: Any) -> float | None:
 
 
 def in_order(message: Any, names: Sequence[str], field: str) -> Vector | None:
-    """Return a JointState's values for the joints `names`, whatever its order; None where one is missing."""
+    """Return a JointState's values for the joints `names`, in any order; None if one is missing."""
     values, present = getattr(message, field), list(message.name)
     try:
         indices = [present.index(name) for name in names]
@@ -86,7 +86,7 @@ def quaternion(yaw: float) -> dict[str, float]:
 
 
 def planar_state(odometry: Any) -> tuple[tuple[float, float, float], tuple[float, float]] | None:
-    """Return an Odometry's x, y [m], yaw [rad] and its velocities [m/s], [rad/s]; None for what is not finite."""
+    """Return an Odometry's x, y [m], yaw [rad] and velocities [m/s], [rad/s]; None if not finite."""
     pose, twist = odometry.pose.pose, odometry.twist.twist
     state = (pose.position.x, pose.position.y, yaw_of(pose.orientation)), (twist.linear.x, twist.angular.z)
     return state if all(map(math.isfinite, (*state[0], *state[1]))) else None
@@ -101,7 +101,7 @@ def twist(linear: float, angular: float, stamped_s: float | None = None) -> dict
 
 
 def trajectory(joints: Sequence[str], points: Sequence[tuple[float, ArrayLike, ArrayLike]]) -> dict[str, Any]:
-    """Return a JointTrajectory that starts at once, of points (time from its start [s], positions, velocities)."""
+    """Return a JointTrajectory that starts at once, with points (time from its start [s], positions, velocities)."""
     return {
         "joint_names": list(joints),
         "points": [
@@ -129,7 +129,7 @@ def scan_message(ranges: Vector, angle_min: float, increment: float, frame: str,
 
 
 def scan_points(scan: Any, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Vector:
-    """Return where a LaserScan's beams end (n, 2) [m], of those that meet something; `pose` is the scanner's."""
+    """Return the end points (n, 2) [m] of a LaserScan's beams that hit something; `pose` is the scanner's."""
     ranges = np.array([math.inf if one is None else one for one in scan.ranges], dtype=np.float64)
     angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges)) + pose[2]
     meets = np.isfinite(ranges) & (ranges >= scan.range_min) & (ranges < scan.range_max)
@@ -138,7 +138,7 @@ def scan_points(scan: Any, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -
 
 
 def readings(points: Vector) -> Vector:
-    """Return what the MiR100's two scanners read (1012,) [m] of points (n, 2) [m] in base_link."""
+    """Return the readings (1012,) [m] of the MiR100's two scanners for points (n, 2) [m] in base_link."""
     return np.concatenate([_seen_by(FRONT_SCANNER, points), _seen_by(BACK_SCANNER, points)])
 
 

@@ -1,4 +1,4 @@
-"""A real base in the place of the simulated MiR100: the environments see it through the scene's model.
+"""A real base in place of the simulated MiR100: the environments see it through the scene's model.
 
 The model stands where odometry has the base; commands go to the base.
 """
@@ -60,7 +60,7 @@ class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):  # pyright: 
         return False
 
     def command(self, linear: float, angular: float) -> bool:
-        """Replace the velocities [m/s], [rad/s]; return False where they are not acted on."""
+        """Replace the velocities [m/s], [rad/s]; return False if they are not used."""
         super().command(linear, angular)
         may_act = self._may_act()
         if may_act:
@@ -69,7 +69,7 @@ class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):  # pyright: 
 
     @property
     def scan(self) -> Vector:
-        """All readings [m], (1012,), computed from what the base's scans see."""
+        """All readings [m], (1012,), computed from the base's scans."""
         return self._readings
 
     @property

@@ -1,4 +1,4 @@
-"""Link through rclpy, the machine's own: a node, and a thread that takes its messages."""
+"""Link through the machine's own rclpy: a node, and a thread that takes its messages."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from typing import Any
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.link import Endpoint, Publish, safely
 
-GUARD = "rlservo_guard"  # publishes zeros alone, when its own commander has fallen silent
-ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, for the processes that we start too
+GUARD = "rlservo_guard"  # publishes only zeros, when its own commander has fallen silent
+ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, also for the processes that we start
 
 
 class RclpyLink:
-    """A node of ROS 2 under a name of its own: two of one name could not be told apart."""
+    """A ROS 2 node with a unique name: two with one name could not be told apart."""
 
     def __init__(self, name: str, *, is_unique: bool = False) -> None:
-        """Raise RobotError without rclpy. `is_unique`: the name is used as it is, else our process id follows it."""
+        """Join the graph. `is_unique`: the name is used as it is, else with our process id. Raises RobotError."""
         try:
             import rclpy  # pyright: ignore[reportMissingImports]
             from rclpy import executors  # pyright: ignore[reportMissingImports]
             from rclpy.signals import SignalHandlerOptions  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise RobotError(
-                f"ROS 2's rclpy cannot be imported ({error}): source /opt/ros/DISTRIBUTION/setup.bash, with the Python "
-                "that this ROS 2 is built for"
+                f"ROS 2's rclpy cannot be imported ({error}): source /opt/ros/DISTRIBUTION/setup.bash, and use the "
+                "Python that this ROS 2 is built for"
             ) from error
         self._context = rclpy.Context()
         arguments = [one for one in os.environ.get(ARGUMENTS_VARIABLE, "").split("\n") if one]
         words = ["--ros-args", *(arguments if is_unique else _without_names(arguments))] if arguments else None
         try:
             rclpy.init(args=words, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # rcl's own errors share no base that is public
-            raise RobotError(f"ROS 2 takes no arguments {' '.join(arguments)}: {error}") from error
+        except Exception as error:  # rcl's own errors share no public base
+            raise RobotError(f"ROS 2 does not accept the arguments {' '.join(arguments)}: {error}") from error
         self.node: Any = rclpy.create_node(
             name if is_unique else f"{name}_{os.getpid()}", context=self._context,
             automatically_declare_parameters_from_overrides=is_unique,
@@ -59,13 +59,13 @@ class RclpyLink:
         return float(self.node.get_clock().now().nanoseconds * 1e-9)
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
-        """Subscribe as sensors' topics are: the newest message, best effort; a kept one reliably."""
+        """Subscribe to the newest message, best effort as for sensors; to a kept one reliably."""
         qos = self._qos(is_kept, False)
         made = self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), qos)
         self._own["subscriber", made.topic_name] += 1
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
-        """Publish reliably, the newest message alone."""
+        """Publish reliably, only the newest message."""
         made = message_class(kind)
         publisher = self.node.create_publisher(made, topic, self._qos(is_kept, True))
         self._own["publisher", publisher.topic_name] += 1
@@ -90,7 +90,7 @@ class RclpyLink:
         return self._others("publisher", topic, self.node.get_publishers_info_by_topic(topic))
 
     def rivals(self, topic: str) -> list[Endpoint]:
-        """Return the publishers of other nodes: a robot obeys one. A guard is none."""
+        """Return the publishers of other nodes, as a robot obeys one; a guard does not count."""
         return [one for one in self.publishers(topic) if not one.node.rpartition("/")[2].startswith(GUARD)]
 
     def subscribers(self, topic: str) -> list[Endpoint]:
@@ -126,7 +126,7 @@ class RclpyLink:
 
 @functools.cache
 def message_class(kind: str) -> Any:
-    """Return the class of 'sensor_msgs/msg/JointState'. Raises RobotError where its package is not installed."""
+    """Return the class of 'sensor_msgs/msg/JointState'. Raises RobotError if its package is not installed."""
     package, _, rest = kind.partition("/")
     folder, _, name = rest.rpartition("/")
     try:
@@ -136,7 +136,7 @@ def message_class(kind: str) -> Any:
 
 
 def fill(message: Any, values: Mapping[str, Any]) -> Any:
-    """Set the fields of a message that a dictionary names, and return it."""
+    """Set the fields of a message from a dictionary, and return it."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             fill(getattr(message, name), value)
@@ -150,7 +150,7 @@ def fill(message: Any, values: Mapping[str, Any]) -> Any:
 
 
 def _without_names(arguments: Sequence[str]) -> list[str]:
-    """Return ROS arguments without those that would give all our nodes one name."""
+    """Return ROS arguments without those that would give all our nodes the same name."""
     kept = list(arguments)
     for index in reversed(range(len(kept))):
         if kept[index].startswith(("__node:=", "__name:=")):

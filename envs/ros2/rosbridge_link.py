@@ -1,4 +1,4 @@
-"""Link through a rosbridge (WebSocket), with roslibpy: no ROS on our side. A MiR has one on port 9090."""
+"""Link through a rosbridge (WebSocket), with roslibpy: it needs no ROS here. A MiR has one on port 9090."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ CALL_S = 5.0
 
 
 class RosbridgeLink:
-    """A client of a rosbridge. Its node there is the bridge's own, which all its clients share."""
+    """A client of a rosbridge. All clients share the bridge's node."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Raise RobotError without roslibpy, or where no rosbridge answers."""
+        """Connect. Raises RobotError without roslibpy, or if no rosbridge answers."""
         try:
             import roslibpy
         except ImportError as error:
@@ -27,13 +27,11 @@ class RosbridgeLink:
             raise RobotError(f"a rosbridge needs roslibpy ({error}): {how}") from error
         self._library: Any = roslibpy
         try:
-            socket.create_connection(
-                (host, port), CONNECT_S
-            ).close()  # roslibpy tries again and again, and says nothing
+            socket.create_connection((host, port), CONNECT_S).close()  # roslibpy retries repeatedly and silently
         except OSError as error:
             reason = error.strerror or "no answer"
             raise RobotError(
-                f"no rosbridge answers at {host}:{port} ({reason}): is the robot on, and on this network"
+                f"no rosbridge answers at {host}:{port} ({reason}): is the robot switched on and on this network"
             ) from error
         self._ros: Any = roslibpy.Ros(host, port)
         self._topics: list[Any] = []
@@ -41,7 +39,7 @@ class RosbridgeLink:
             self._ros.run(timeout=CONNECT_S)
         except Exception as error:
             self._ros.close()
-            raise RobotError(f"what answers at {host}:{port} is no rosbridge: {error}") from error
+            raise RobotError(f"the server at {host}:{port} is not a rosbridge: {error}") from error
 
     def now_s(self) -> float:
         """Return the system's time [s]."""
@@ -49,13 +47,13 @@ class RosbridgeLink:
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
         """Subscribe to the newest message."""
-        del is_kept  # the bridge's own subscription decides
+        del is_kept  # the bridge's own subscription decides this
         one = self._library.Topic(self._ros, topic, kind, queue_length=1)
         one.subscribe(safely(lambda message: on_message(parse(message)), topic))
         self._topics.append(one)
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
-        """Publish the newest message alone."""
+        """Publish only the newest message."""
         one = self._library.Topic(self._ros, topic, kind, queue_size=1, latch=is_kept)
         one.advertise()
         self._topics.append(one)
@@ -67,18 +65,18 @@ class RosbridgeLink:
         return publish
 
     def publishers(self, topic: str) -> list[Endpoint]:
-        """Return the nodes that publish, the bridge for its other clients, under the topic's type."""
+        """Return the nodes that publish, with the topic's type; the bridge stands for its other clients."""
         return self._nodes("publishers", topic)
 
     def rivals(self, topic: str) -> list[Endpoint]:
-        """Return the bridge, where another client of it publishes; a robot's own nodes may always do."""
+        """Return the bridge if another client of it publishes; a robot's own nodes always may."""
         if any(one.name == topic and one.is_advertised for one in self._topics):
             return []
         nodes = [one for one in self.publishers(topic) if "rosbridge" in one.node]
         return [Endpoint(f"another client of {one.node}", one.type) for one in nodes]
 
     def subscribers(self, topic: str) -> list[Endpoint]:
-        """Return the nodes that subscribe, under the topic's type."""
+        """Return the nodes that subscribe, with the topic's type."""
         return self._nodes("subscribers", topic)
 
     def close(self) -> None:
@@ -99,6 +97,6 @@ class RosbridgeLink:
         caller = self._library.Service(self._ros, f"/rosapi/{service}", kind)
         try:
             answer: Mapping[str, Any] = caller.call(self._library.ServiceRequest({"topic": topic}), timeout=CALL_S)
-        except Exception as error:  # a time-out, or the bridge's refusal
+        except Exception as error:  # a time-out or the bridge's refusal
             raise RobotError(f"the rosbridge does not answer /rosapi/{service} for {topic}: {error}") from error
         return answer

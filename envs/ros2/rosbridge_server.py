@@ -1,7 +1,7 @@
 """Rosbridge in front of a simulated robot: rosbridge's JSON over WebSocket, without ROS.
 
-Topics alone (advertise, publish, subscribe), and what rosapi tells about them. A client that does not keep up gets the
-newest message of each topic.
+Only topics (advertise, publish, subscribe), and rosapi's services about them. A client that is too slow gets the newest
+message of each topic.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ BRIDGE, ROBOT = "/rosbridge_websocket", "/robot"
 
 log = logging.getLogger("rlservo.robot")
 websocket_log = logging.getLogger("rlservo.rosbridge")
-websocket_log.setLevel(logging.CRITICAL)  # not each connection that comes and goes, whatever it says
+websocket_log.setLevel(logging.CRITICAL)  # not every connection that opens and closes
 
 
 class _Client:
-    """One connection: what it subscribes to and advertises, and what waits to be sent."""
+    """One connection: its subscriptions and advertisements, and the messages that wait to be sent."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection
@@ -43,7 +43,7 @@ class _Client:
         self._thread.start()
 
     def send(self, key: str, text: str) -> None:
-        """Send soon; of two messages under one key the newer."""
+        """Queue a message; a newer one replaces an older one with the same key."""
         with self._changed:
             self._waiting[key] = text
             self._changed.notify()
@@ -67,10 +67,10 @@ class _Client:
 
 
 class RosbridgeServer:
-    """A link of the robot's own side: what it publishes goes to clients, what they publish comes to it."""
+    """A link on the robot's side: it publishes to clients, and receives what they publish."""
 
     def __init__(self, host: str, port: int) -> None:
-        """Listen. Raises RobotError where the port is taken."""
+        """Listen. Raises RobotError if the port is in use."""
         self._clients: set[_Client] = set()
         self._lock = threading.Lock()
         self._types: dict[str, str] = {}
@@ -93,12 +93,12 @@ class RosbridgeServer:
         return time.time()
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
-        """Call `on_message` with what clients publish."""
+        """Call `on_message` with the messages that clients publish."""
         del is_kept
         self._types[topic], self._takers[topic] = kind, on_message
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
-        """Return a function that sends to the clients that subscribe."""
+        """Return a function that sends to the subscribed clients."""
         self._types[topic] = kind
         self._published.add(topic)
 
@@ -159,8 +159,8 @@ class RosbridgeServer:
             elif op == "call_service":
                 self._answer(client, request)
             else:
-                raise ValueError(f"op {op!r} is not known here")
-        except Exception as error:  # anybody's JSON
+                raise ValueError(f"op {op!r} is not supported")
+        except Exception as error:  # JSON from any client
             log.warning("rosbridge: a client's message was refused: %s: %s", type(error).__name__, error)
             client.send("status", json.dumps({"op": "status", "level": "error", "msg": str(error)}))
 

@@ -18,7 +18,7 @@ from rlservo.envs.ur_controller.console import obey
 from rlservo.envs.ur_controller.controller import Controller, RobotMode, SafetyMode
 from rlservo.envs.ur_controller.server import Link as LinkFaults
 
-LOOKAHEAD_S = 0.1  # the driver's own 0.03 s makes a jump of every pause of a machine that is not real-time
+LOOKAHEAD_S = 0.1  # with the driver's own 0.03 s, every pause of a machine that is not real-time becomes a jump
 VELOCITY_ACCELERATION = 25.0  # [rad/s^2], of speedj for velocity commands
 STATUS_PERIOD_S = 0.1
 # The driver's joint states are not in kinematic order.
@@ -30,10 +30,10 @@ log = logging.getLogger("rlservo.robot")
 
 
 class SimulatedArm:
-    """The arm and its controllers, of which one is active: position, velocity or trajectory."""
+    """The arm with one active controller: position, velocity or trajectory."""
 
     def __init__(self, ur_model: str, *, controller: str, prefix: str, faults: LinkFaults) -> None:
-        """Join the graph. Raises RobotError without rclpy, ValueError for a model that does not exist."""
+        """Join the graph. Raises RobotError without rclpy, ValueError for an unknown model."""
         self.controller = Controller(ur_model)
         self.link = faults
         self.messages = FaultyLink(faults)
@@ -107,12 +107,12 @@ class SimulatedArm:
             self.controller.servo(message.data, LOOKAHEAD_S)
 
     def _take_velocity(self, message: Any) -> None:
-        """Take a velocity up. It holds until the next one comes: the controller knows no time-out."""
+        """Apply a velocity until the next one comes: the controller has no time-out."""
         if self._is_ready(message.data, 6):
             self.controller.speed(message.data, VELOCITY_ACCELERATION)
 
     def _take_trajectory(self, message: Any) -> None:
-        """Replace the trajectory, as the joint trajectory controller does; one that ends in motion is rejected."""
+        """Replace the trajectory, like the joint trajectory controller; one that ends in motion is rejected."""
         names, now_s = list(message.joint_names), self.controller.time_s
         if sorted(names) != sorted(self._joints) or not message.points:
             log.warning("a trajectory was rejected: its joints are %s", names)
@@ -130,7 +130,7 @@ class SimulatedArm:
         self._trajectory = points
 
     def _along_trajectory(self) -> Vector:
-        """Return where the trajectory is at the end of this cycle, on a cubic between its points."""
+        """Return the trajectory's state at the end of this cycle, on a cubic between its points."""
         at = self.controller.time_s + self.dt
         points = self._trajectory
         while len(points) > 2 and points[1][0] <= at:
@@ -153,7 +153,7 @@ class SimulatedArm:
 
 
 def _dashboard_kind(name: str) -> str:
-    """Return ur_dashboard_msgs' type, or a plain number where that package is not installed."""
+    """Return ur_dashboard_msgs' type, or a plain number if that package is not installed."""
     kind = f"ur_dashboard_msgs/msg/{name}"
     try:
         message_class(kind)

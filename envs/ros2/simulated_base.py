@@ -38,11 +38,11 @@ from rlservo.envs.ur_controller.console import obey_link
 from rlservo.envs.ur_controller.server import Link as LinkFaults
 
 SUBSTEPS = 2  # of 0.01 s a tick: odometry at 50 Hz
-SCAN_TICKS = 4  # 12.5 Hz, as the SICK S300 has
+SCAN_TICKS = 4  # 12.5 Hz, as on the SICK S300
 MERGED_BEAMS = 720  # of /scan, all around base_link
 STARTS = {"lab_6x8": (0.0, 2.6, 0.0)}  # [m], [m], [rad], clear of the cubes
 HELP = """\
-place 1 0 3.14     put the robot somewhere: x, y, yaw  state          where it is
+place 1 0 3.14     put the robot at: x, y, yaw  state          where it is
 latency 20         link: ms each way                   jitter 5       up to so many ms more
 drop 0.01          link: share of messages lost        down, up       link: cut and restored"""
 
@@ -50,10 +50,10 @@ log = logging.getLogger("rlservo.robot")
 
 
 class SimulatedBase:
-    """The base, its drive with a time-out and limits, and its scanners."""
+    """The base: its drive with a time-out and limits, and its scanners."""
 
     def __init__(self, links: Sequence[Topics], *, world: str, is_stamped: bool, faults: LinkFaults) -> None:
-        """Offer the topics on all links. Raises ValueError for a world that does not exist."""
+        """Offer the topics on all links. Raises ValueError for an unknown world."""
         self.simulation = Mir100Simulation(world)
         self.simulation.place(STARTS.get(world, (0.0, 0.0, 0.0)))
         self.messages = FaultyLink(faults)
@@ -114,7 +114,7 @@ class SimulatedBase:
         twist = message
         if self._is_stamped:
             twist, made_s = message.twist, stamp_of(message)
-            # A zero stamp means now, as diff_drive_controller takes it.
+            # A zero stamp means now, as in diff_drive_controller.
             if made_s is not None and abs(self._links[0].now_s() - made_s) > COMMAND_TIMEOUT_S:
                 log.warning("a velocity was ignored: its stamp is older than %g s", COMMAND_TIMEOUT_S)
                 return
@@ -142,7 +142,7 @@ class SimulatedBase:
 
 
 def _whole(scanner: Scanner, ranges: Any) -> Any:
-    """Return all of a scanner's beams [m]; those that the housing blinds read zero."""
+    """Return all of a scanner's beams [m]; those blocked by the housing read zero."""
     whole = np.zeros(scanner.BEAMS)
     whole[scanner.dropped_first : scanner.BEAMS - scanner.dropped_last] = ranges
     return whole

@@ -1,4 +1,4 @@
-"""Loop of a simulated robot behind ROS: its clock, its console, and the faults of the link to it."""
+"""Loop of a simulated robot behind ROS: its clock, its console, and faults of its link."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import numpy as np
 from rlservo.envs.ros2.link import Publish, safely
 from rlservo.envs.ur_controller.server import Link as LinkFaults
 
-LONGEST_CATCH_UP_S = 0.5  # [s] of cycles that a loop which was held up makes good
+LONGEST_CATCH_UP_S = 0.5  # [s] of cycles that a delayed loop catches up
 
 
 class SimulatedRobot(Protocol):
-    """A robot that the loop drives; all of it is called from the loop's thread."""
+    """A robot driven by the loop; all calls come from the loop's thread."""
 
     dt: float  # [s], of a control cycle
     messages: FaultyLink
@@ -34,7 +34,7 @@ class SimulatedRobot(Protocol):
 
 
 class FaultyLink:
-    """Messages both ways, late or lost as `faults` say."""
+    """Messages in both directions, delayed or lost according to `faults`."""
 
     def __init__(self, faults: LinkFaults, seed: int = 0) -> None:
         self.faults = faults
@@ -44,7 +44,7 @@ class FaultyLink:
         self._lock = threading.Lock()
 
     def outgoing(self, publishers: Sequence[Publish]) -> Publish:
-        """Return what publishes on all of several links."""
+        """Return a function that publishes on all of the links."""
 
         def publish(values: Mapping[str, Any]) -> None:
             def send() -> None:
@@ -56,12 +56,12 @@ class FaultyLink:
         return publish
 
     def incoming(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return a callback that has a message taken in the loop's thread."""
+        """Return a callback that passes a message to the loop's thread."""
         take = safely(take, "a command topic")
         return lambda message: self._pass(lambda: take(message), may_wait=False)
 
     def deliver(self) -> None:
-        """Deliver what is due. Only the loop's thread calls it."""
+        """Deliver the messages that are due. Only the loop's thread calls it."""
         while True:
             with self._lock:
                 if not self._waiting or self._waiting[0][0] > time.monotonic():

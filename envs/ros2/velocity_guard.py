@@ -1,6 +1,6 @@
 """Guard of a velocity topic: publishes zeros when its standard input falls silent, and once when it ends.
 
-ros2_control's forward velocity controller has no time-out: the arm of a process that was killed would move on.
+ros2_control's forward velocity controller has no time-out: the arm of a killed process would continue to move.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from rlservo.envs.ros2.link import wait_until
 from rlservo.envs.ros2.messages import NUMBERS
 from rlservo.envs.ros2.rclpy_link import GUARD, RclpyLink
 
-READY = b"ready\n"  # on standard output: from now on it guards
+READY = b"ready\n"  # on standard output: the guard is active
 FIND_S = 20.0
 SILENCE_S = 0.1
-SETTLE_S = 0.5  # in which the last zeros reach the controller
+SETTLE_S = 0.5  # for the last zeros to reach the controller
 
 
 def main(topic: str) -> None:
     """Guard a topic until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     link = RclpyLink(GUARD)
-    publish, is_fed = link.advertise(topic, NUMBERS), False  # now: a subscriber takes a while to find it
+    publish, is_fed = link.advertise(topic, NUMBERS), False  # advertised now, as a subscriber takes a while to find it
     wait_until(lambda: bool(link.subscribers(topic)), f"nothing subscribes to {topic}", FIND_S)
     time.sleep(SETTLE_S)
     os.write(1, READY)
@@ -36,7 +36,7 @@ def main(topic: str) -> None:
         is_fed = is_fed or bool(ready)
         if is_fed and not ready:
             publish({"data": [0.0] * 6})
-    for _ in range(int(SETTLE_S / SILENCE_S) if is_fed else 0):  # else the topic may be another node's
+    for _ in range(int(SETTLE_S / SILENCE_S) if is_fed else 0):  # otherwise the topic may belong to another node
         publish({"data": [0.0] * 6})
         select.select([], [], [], SILENCE_S)
     link.close()

@@ -1,4 +1,4 @@
 """UR controller on MuJoCo for tests without an arm: RTDE, dashboard and script ports, link faults.
 
-docs/reference/ur-controller.md lists where it knowingly differs from a real one.
+docs/reference/ur-controller.md lists its known differences from a real one.
 """

@@ -1,4 +1,4 @@
-"""Commands that a person types, or a test writes, while the simulated controller runs: stops, slider, link faults."""
+"""Console commands of the simulated controller, typed by a person or written by a test: stops, slider, link faults."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rlservo.envs.ur_controller.server import Link
 
 
 class Simulated(Protocol):
-    """A controller and the link to it."""
+    """A controller and its link."""
 
     @property
     def controller(self) -> Controller: ...
@@ -21,7 +21,7 @@ class Simulated(Protocol):
 
 HELP = """\
 protective         protective stop          unlock         unlock it, as the dashboard does
-emergency          emergency stop           release        pull it out again, power on, release the brakes
+emergency          emergency stop           release        pull it out, power on, release the brakes
 slider 0.5         speed slider             remote, local  remote control on or off
 latency 20         link: ms each way        jitter 5       link: up to so many ms more
 drop 0.01          link: share of RTDE data packages lost

@@ -1,6 +1,6 @@
-"""The simulated controller: the arm, its safety stops, its registers and the program that runs on it.
+"""The simulated controller: the arm, its safety stops, its registers and its program.
 
-One call of `tick` is one control cycle. Time is the controller's own: cycles since it was started.
+One call of `tick` is one control cycle. The controller has its own time: cycles since its start.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ log = logging.getLogger("rlservo.ur_controller")
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
-STOP_DECELERATION = 10.0  # [rad/s^2], of every stop that no program asks for
-LARGEST_ACCELERATION = 40.0  # [rad/s^2] of a setpoint; more is a jump, and a protective stop
+STOP_DECELERATION = 10.0  # [rad/s^2], of every stop that is not requested by a program
+LARGEST_ACCELERATION = 40.0  # [rad/s^2] of a setpoint; more counts as a jump and causes a protective stop
 UNLOCK_S = 5.0  # [s] after a protective stop before it can be unlocked, as on the arm
 REGISTERS = 48
 TRACE = 60_000  # control cycles
@@ -52,13 +52,13 @@ class SafetyMode(IntEnum):
 
 
 class Sample(NamedTuple):
-    """The arm at the end of a control cycle."""
+    """State of the arm at the end of a control cycle."""
 
     time_s: float
     positions: Vector  # [rad], (6,)
     velocities: Vector  # [rad/s], (6,)
     setpoint_velocity: Vector  # [rad/s], (6,)
-    commands: int  # that have arrived since the start
+    commands: int  # arrived since the start
     held_up_s: float  # since the start, by the machine
 
 
@@ -70,7 +70,7 @@ class _Watchdog:
 
 
 class Controller:
-    """One arm and the program on it. Not thread-safe: one loop calls it."""
+    """One arm and its program. Not thread-safe: one loop calls it."""
 
     def __init__(self, ur_model: str = "ur5e") -> None:
         self.ur_model = ur_model
@@ -87,10 +87,10 @@ class Controller:
         self.speed_fraction = 1.0
         self.payload_kg = 0.0
         self.ticks = 0
-        self.commands = 0  # packages with a command, or a sign of life, that have arrived
+        self.commands = 0  # packages with a command or a watchdog signal that have arrived
         self.held_up_s = 0.0  # since the start, by the machine
         self.trace: deque[Sample] = deque(maxlen=TRACE)
-        self.stop_reasons: list[tuple[float, str]] = []  # when [s], why
+        self.stop_reasons: list[tuple[float, str]] = []  # time [s], reason
         self._velocity: Vector = np.zeros(6)  # [rad/s], of the setpoint
         self._motion: Motion | None = None
         self._is_free = False
@@ -117,7 +117,7 @@ class Controller:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the setpoint moves, or is about to."""
+        """Whether the setpoint moves or is about to move."""
         return self._motion is not None or bool(self._velocity.any())
 
     @property
@@ -141,7 +141,7 @@ class Controller:
         return [-x, -y, z, *vector.tolist()]
 
     def positions_before(self, cycles: int) -> list[float]:
-        """Return the joint positions [rad] of so many control cycles ago."""
+        """Return the joint positions [rad] of a given number of control cycles ago."""
         index = max(len(self.trace) - 1 - min(max(cycles, 0), HISTORY), 0)
         positions: list[float] = (self.trace[index].positions if self.trace else np.array(START_JOINTS)).tolist()
         return positions
@@ -149,7 +149,7 @@ class Controller:
     # -- programs
 
     def load_program(self, text: str) -> None:
-        """Run a URScript program, as far as it is known: ur_rtde's control script. One that runs is ended."""
+        """Run a URScript program; only ur_rtde's control script is supported. A running program is ended."""
         if not self.is_remote:
             log.warning("a program was refused: the controller is in local control")
             return
@@ -168,7 +168,7 @@ class Controller:
         self.stop(STOP_DECELERATION)
 
     def set_watchdog(self, register: int, min_frequency_hz: float) -> None:
-        """End the program when an input register is not written for 1 / `min_frequency_hz`; 0 ends the watch."""
+        """End the program when an input register is not written for 1 / `min_frequency_hz`; 0 turns this off."""
         period_s = 1.0 / min_frequency_hz if min_frequency_hz > 0.0 else 0.0
         self._watchdog = _Watchdog(register, period_s, self.time_s) if period_s else None
 
@@ -179,7 +179,7 @@ class Controller:
             self._watchdog.fed_at_s = self.time_s
 
     def excuse(self, held_up_s: float) -> None:
-        """Discount time [s] for which the controller itself was held up and that it now catches up."""
+        """Exclude time [s] for which the controller itself was delayed and which it now catches up."""
         self.held_up_s += held_up_s
         if self._watchdog is not None:
             self._watchdog.fed_at_s += held_up_s
@@ -195,11 +195,11 @@ class Controller:
             self._motion = Servo(goal, lookahead_s)
 
     def speed(self, velocity: ArrayLike, acceleration: float) -> None:
-        """Take up a velocity [rad/s] (6,)."""
+        """Accelerate to a velocity [rad/s] (6,)."""
         self._motion = Ramp(np.asarray(velocity, dtype=np.float64), acceleration)
 
     def move(self, goal: ArrayLike, speed: float, acceleration: float) -> None:
-        """Move to joint positions [rad] (6,) and stand there."""
+        """Move to joint positions [rad] (6,) and hold there."""
         self._motion = MoveJ(self.target, np.asarray(goal, dtype=np.float64), speed, acceleration)
 
     def stop(self, deceleration: float) -> None:
@@ -223,18 +223,18 @@ class Controller:
         self.stop_program(f"protective stop: {why}")
 
     def stop_in_emergency(self) -> None:
-        """Press the emergency stop: the arm stops and is without power."""
+        """Press the emergency stop: the arm stops and loses power."""
         log.warning("%.3f s: emergency stop", self.time_s)
         self.safety_mode, self.robot_mode = SafetyMode.ROBOT_EMERGENCY_STOP, RobotMode.POWER_OFF
         self.stop_program("emergency stop")
 
     def recover_from_emergency_stop(self) -> None:
-        """Pull the emergency stop out again, power the arm on and release its brakes."""
+        """Release the emergency stop, power the arm on and release its brakes."""
         if self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
             self.safety_mode, self.robot_mode = SafetyMode.NORMAL, RobotMode.RUNNING
 
     def unlock_protective_stop(self) -> bool:
-        """End a protective stop that is five seconds old; return whether the arm is free of it."""
+        """Unlock a protective stop that is at least five seconds old; return whether none is left."""
         if self.safety_mode == SafetyMode.PROTECTIVE_STOP:
             if self.time_s - self._stopped_at_s < UNLOCK_S:
                 return False
@@ -253,7 +253,7 @@ class Controller:
             try:
                 next(self._program)
             except StopIteration:
-                self.stop_program("it came to its end")
+                self.stop_program("it reached its end")
         if self._is_free:
             self.simulation.hold()
         else:
@@ -282,7 +282,7 @@ class Controller:
     def _violation(self, velocity: Vector) -> str | None:
         for joint, value, limit in zip(JOINTS, velocity, self.simulation.max_velocity, strict=True):
             if not abs(value) <= limit * 1.001:
-                return f"{joint} at {value:.3g} rad/s, over its limit of {limit:.3g}"
+                return f"{joint} moves at {value:.3g} rad/s, over its limit of {limit:.3g}"
         acceleration = (velocity - self._velocity) / self.dt
         if not np.abs(acceleration).max() <= LARGEST_ACCELERATION * 1.001:
             joint = JOINTS[int(np.abs(acceleration).argmax())]

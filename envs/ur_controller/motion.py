@@ -1,4 +1,4 @@
-"""Motions of the simulated controller: each gives the joint setpoint's next velocity, a control cycle at a time."""
+"""Motions of the simulated controller: each gives the joint setpoint's velocity for one control cycle at a time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Motion(Protocol):
 
 
 class Ramp:
-    """speedj and stopj: towards a velocity, the joint that changes most at `acceleration` [rad/s^2]."""
+    """speedj and stopj: towards a velocity, with the joint that changes most at `acceleration` [rad/s^2]."""
 
     def __init__(self, target: Vector, acceleration: float) -> None:
         self.target, self.acceleration, self.is_done = target, max(acceleration, 1e-3), False

@@ -1,7 +1,7 @@
 """ur_rtde's control script as the simulated controller runs it: command numbers in, motions out.
 
-Source of numbers and registers: ur_rtde 1.5 and 1.6, scripts/rtde_control.script. A generator stands for the program:
-each `next` is what the script does between two `sync()`.
+Source of numbers and registers: ur_rtde 1.5 and 1.6, scripts/rtde_control.script. A generator represents the program:
+each `next` runs the script's part between two `sync()`.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("rlservo.ur_controller")
 
-MARK = "RTDE Control Script"  # in the text of every version of it
+MARK = "RTDE Control Script"  # part of the text of every version
 NO_COMMAND, STOP_SCRIPT = 0, 255
 READY, DONE = 1, 2  # output_int_register_0
 SERVOJ, SPEEDJ = 11, 9
-REAL_TIME = {SERVOJ, SPEEDJ, 26, 27}  # answered with READY in the same cycle, and read again in the next
+REAL_TIME = {SERVOJ, SPEEDJ, 26, 27}  # answered with READY in the same cycle and read again in the next
 _OFFSET = re.compile(r"reg_offset_int\s*=[^\n]*\n?\s*([0-9]+)")
 
 
 def control_program(controller: Controller, text: str) -> Iterator[None]:
-    """Return the running program; one that is not ur_rtde's control script ends at once with a line in the log."""
+    """Return the running program; anything but ur_rtde's control script ends at once with a log line."""
     if MARK not in text:
-        log.warning("a program of %d characters is not ur_rtde's control script and is not run", len(text))
+        log.warning("a program of %d characters was not run: it is not ur_rtde's control script", len(text))
         return
     found = _OFFSET.search(text)
     program = _ControlScript(controller, int(found[1]) if found else 0)

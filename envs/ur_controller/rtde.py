@@ -1,4 +1,4 @@
-"""RTDE on the controller's side: recipes of a client, packages in and out.
+"""RTDE on the controller's side: a client's recipes, packages in and out.
 
 Source of the protocol: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
 """
@@ -13,7 +13,7 @@ from typing import Any
 from rlservo.envs.ur_controller.controller import REGISTERS, Controller, RobotMode, SafetyMode
 
 HEADER = struct.Struct(">HB")
-LARGEST_PACKAGE = 4096  # [bytes] of a client's
+LARGEST_PACKAGE = 4096  # [bytes] of a client's package
 FORMATS = {
     "BOOL": "?", "UINT8": "B", "UINT32": "I", "UINT64": "Q", "INT32": "i", "DOUBLE": "d",
     "VECTOR3D": "3d", "VECTOR6D": "6d", "VECTOR6INT32": "6i", "VECTOR6UINT32": "6I",
@@ -103,12 +103,12 @@ INPUTS: dict[str, str] = {
 
 
 class RtdeSession:
-    """One client's connection: `receive` takes its bytes, `sample` gives what it is due in this cycle."""
+    """One client's connection: `receive` takes its bytes, `sample` gives its data package for this cycle."""
 
     def __init__(self, controller: Controller, registers_in_use: dict[str, RtdeSession]) -> None:
         self._controller, self._in_use = controller, registers_in_use
         self._buffer = b""
-        self.allowance = math.inf  # data packages that may still be taken in this cycle
+        self.allowance = math.inf  # data packages that may still be accepted in this cycle
         self._inputs: list[tuple[list[str], struct.Struct]] = []
         self._outputs: list[Callable[[Controller], Any]] = []
         self._package = struct.Struct(">")
@@ -132,11 +132,11 @@ class RtdeSession:
 
     @property
     def is_behind(self) -> bool:
-        """Whether bytes wait to be taken."""
+        """Whether received bytes wait to be processed."""
         return len(self._buffer) >= HEADER.size
 
     def sample(self) -> bytes:
-        """Return the data package of this control cycle; nothing if the client is not due one."""
+        """Return the data package of this control cycle; empty if none is due."""
         if not self._is_started or self._controller.ticks % self._every:
             return b""
         values: list[Any] = []
@@ -149,7 +149,7 @@ class RtdeSession:
         return _package("U", b"\x01" + self._package.pack(*values))
 
     def close(self) -> None:
-        """Give the input registers back."""
+        """Release the input registers."""
         for name in [name for name, user in self._in_use.items() if user is self]:
             del self._in_use[name]
 
@@ -170,7 +170,7 @@ class RtdeSession:
             return b""
         if kind == "M":
             return b""
-        raise ValueError(f"a package of type {kind!r}: expected one of V, v, O, I, S, P, U and M")
+        raise ValueError(f"package type {kind!r}: expected one of V, v, O, I, S, P, U and M")
 
     def _set_outputs(self, payload: bytes) -> bytes:
         (frequency,) = struct.unpack_from(">d", payload)

@@ -1,8 +1,7 @@
-"""Ports of the simulated controller, its clock, and the faults of the link to it.
+"""Ports of the simulated controller, its clock, and faults of its link.
 
-One loop in one thread: sockets while a control cycle's time has not come, then the cycle. Time is the wall clock's.
-If the machine delays the loop, the cycles are caught up at once, and the watchdog does not count the delay against the
-client.
+One loop in one thread serves sockets until a control cycle is due, then runs the cycle, by the wall clock. If the
+machine delays the loop, the cycles are caught up at once, and the watchdog does not blame the client for the delay.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from rlservo.envs.ur_controller.controller import Controller
 from rlservo.envs.ur_controller.rtde import RtdeSession
 
 DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE = 29999, 30001, 30002, 30003, 30004
-PORTS = (DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE)  # a client has no way to ask for others
-LONGEST_CATCH_UP_S = 2.0  # [s] of cycles that a loop which was held up makes good
-HELD_UP_S = 0.02  # [s], after which the loop was: its client's commands wait in the socket
-LARGEST_BACKLOG = 64 * 1024  # [bytes] for a client that does not read; then samples are dropped
+PORTS = (DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE)  # clients cannot ask for other ports
+LONGEST_CATCH_UP_S = 2.0  # [s] of cycles that a delayed loop catches up
+HELD_UP_S = 0.02  # [s], delay after which its client's commands wait in the socket
+LARGEST_BACKLOG = 64 * 1024  # [bytes] buffered for a client that does not read; beyond it samples are dropped
 LARGEST_PROGRAM = 4 * 1024 * 1024
 PROGRAM_END = b"\nend\n"
 
@@ -37,15 +36,15 @@ log = logging.getLogger("rlservo.ur_controller")
 
 
 class CannotListenError(OSError):
-    """The controller cannot listen on one of its ports; the message names it and the reason."""
+    """The controller cannot listen on one of its ports; the message names the port and the reason."""
 
 
 @dataclass
 class Link:
-    """Faults of the network between client and controller; each way has them."""
+    """Faults of the network between client and controller, in each direction."""
 
     latency_s: float = 0.0
-    jitter_s: float = 0.0  # at most so much more, uniformly; order is kept, as TCP keeps it
+    jitter_s: float = 0.0  # at most this much more, uniformly; in order, as with TCP
     drop: float = 0.0  # share of RTDE's data packages, both ways
     is_down: bool = False
 
@@ -72,7 +71,7 @@ class ControllerServer:
         self._rng = np.random.default_rng(seed)
         self._in_use: dict[str, RtdeSession] = {}
         self._connections: dict[socket.socket, _Connection] = {}
-        self._waiting: list[tuple[float, int, Callable[[], None]]] = []  # data that the link delays, by due time
+        self._waiting: list[tuple[float, int, Callable[[], None]]] = []  # data delayed by the link, by due time
         self._count = 0
         self._asked: list[Callable[[], object]] = []
         self._listeners: dict[socket.socket, int] = {}
@@ -84,7 +83,7 @@ class ControllerServer:
             raise
 
     def do(self, action: Callable[[], object]) -> None:
-        """Run something between two control cycles; from any thread."""
+        """Run a function between two control cycles; callable from any thread."""
         self._asked.append(action)
 
     def serve(self, stop: threading.Event) -> None:
@@ -97,9 +96,9 @@ class ControllerServer:
                 self._pass_traffic(max(0.0, next_due - now))
                 continue
             behind_s, since_s, before = now - due, now - before, now
-            if behind_s > HELD_UP_S:  # of a cycle that is made good in no time, no client can be blamed for its silence
+            if behind_s > HELD_UP_S:  # a cycle that is caught up takes no time, so a client's silence in it is no fault
                 self.controller.excuse(max(0.0, self.controller.dt - since_s))
-            # Commands that wait for a cycle that is made good came one a cycle: all at once they would be a jump.
+            # Commands that wait for caught-up cycles are taken one per cycle: all at once they would be a jump.
             is_made_good = self.controller.dt < behind_s < LONGEST_CATCH_UP_S
             for connection in self._connections.values():
                 if connection.rtde is not None:
@@ -122,7 +121,7 @@ class ControllerServer:
     # -- traffic
 
     def _pass_traffic(self, timeout_s: float) -> None:
-        """Wait for sockets at most this long, and deliver data whose delay on the link is over."""
+        """Wait for sockets at most this long, and deliver data whose delay is over."""
         readers = [] if self.link.is_down else [*self._listeners, *self._connections]
         ready, _, _ = select.select(readers, [], [], timeout_s)
         for each in ready:
@@ -262,6 +261,6 @@ def _listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         listener.close()
         is_taken = error.errno == errno.EADDRINUSE
-        reason = "the port is taken; another address such as 127.0.0.2 has ports of its own" if is_taken else str(error)
+        reason = "the port is in use; another address such as 127.0.0.2 has its own ports" if is_taken else str(error)
         raise CannotListenError(f"cannot listen on {host}:{port}: {reason}") from error
     return listener

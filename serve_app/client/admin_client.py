@@ -15,7 +15,7 @@ from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.admin_key_file import key_file, read_key
 
 KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
-LOOK_TIMEOUT_S = 10.0  # nothing is loaded for it
+LOOK_TIMEOUT_S = 10.0  # for requests that load nothing
 TIMEOUT_S = 90.0  # every replica loads and proves a version before the server answers
 
 
@@ -23,8 +23,8 @@ class AdminClient(Closeable):
     """Changes a server's plan. Every method raises the server's error."""
 
     def __init__(self, url: str, *, api_key: str, timeout_s: float = TIMEOUT_S) -> None:
-        """Send nothing before the first call."""
-        # Not retried: a change that was made and not answered would be made twice.
+        """Take the connection's settings; nothing is sent before the first call."""
+        # Not retried: a change whose answer was lost would be made twice.
         self._transport = Transport(url, timeout_s=timeout_s, retries=0, api_key=api_key)
 
     def replicas(self) -> list[dict[str, Any]]:
@@ -47,29 +47,29 @@ class AdminClient(Closeable):
         return self._transport.get_text("metrics", timeout_s=LOOK_TIMEOUT_S)
 
     def recordings(self) -> dict[str, int]:
-        """Return the server's recordings: the files' names, and how many bytes each has by now."""
+        """Return the server's recordings: the files' names, and the present size of each in bytes."""
         files: dict[str, int] = self._transport.get("v1", "admin", "recordings", timeout_s=LOOK_TIMEOUT_S)
         return files
 
     def recording(self, name: str, begin: int) -> bytes:
-        """Return some MiB of a recording from byte `begin` on, as far as it goes; nothing at its end."""
+        """Return up to some MiB of a recording from byte `begin` on; nothing at its end."""
         return self._transport.get_bytes("v1", "admin", "recordings", name, str(begin))
 
     def plans(self) -> dict[str, int]:
-        """Return the number of the plan that each process follows, by name: every worker, or one replica."""
+        """Return the number of the plan that each process follows, by name: all workers, or one replica."""
         found = re.findall(r'^rlservo_plan_generation\{replica="([^"]*)"\} (\d+)', self.metrics(), re.MULTILINE)
         return {process: int(number) for process, number in found}
 
     def load(self, name: str, version: str | None = None) -> dict[str, Any]:
-        """Load and prove a version; None is the repository's newest."""
+        """Load and prove a version; None means the repository's newest."""
         return self.command(name, "load", {"version": version})
 
     def unload(self, name: str, version: str | None = None) -> dict[str, Any]:
-        """Drop a version, or with None the policy."""
+        """Unload a version, or with None the whole policy."""
         return self.command(name, "unload", {"version": version})
 
     def alias(self, name: str, alias: str, version: str | None, *, expected: str | None = None) -> dict[str, Any]:
-        """Point an alias to a loaded version, or with None remove it; unless it no longer points to `expected`."""
+        """Point an alias to a loaded version, or with None remove it; refused if it no longer points to `expected`."""
         return self.command(name, "alias", {"alias": alias, "version": version, "expected": expected})
 
     def rollback(self, name: str, alias: str) -> dict[str, Any]:
@@ -77,11 +77,11 @@ class AdminClient(Closeable):
         return self.command(name, "rollback", {"alias": alias})
 
     def canary(self, name: str, version: str | None, share: float | None = None) -> dict[str, Any]:
-        """Send a share of the sessions to a version, or with None end that."""
+        """Send a share of the sessions to a version, or with None end the canary."""
         return self.command(name, "canary", {"version": version, "share": share})
 
     def shadow(self, name: str, version: str | None) -> dict[str, Any]:
-        """Run a version as shadow, or with None end that."""
+        """Run a version as shadow, or with None end the shadow."""
         return self.command(name, "shadow", {"version": version})
 
     def close(self) -> None:
@@ -95,9 +95,9 @@ class AdminClient(Closeable):
 
 
 def find_key(url: str, file: Path | None) -> str:
-    """Return the admin key: of the file, of RLSERVO_ADMIN_KEY, or of the server that this user runs on that port.
+    """Return the admin key: from the file, from RLSERVO_ADMIN_KEY, or of this user's server on that port.
 
-    Raises UsageError when there is none.
+    Raises UsageError if there is none.
     """
     if file is not None:
         return read_key(file)
@@ -110,5 +110,5 @@ def find_key(url: str, file: Path | None) -> str:
         return read_key(local)
     raise UsageError(
         f"administration needs an admin key: name its file with --key-file or set {KEY_VARIABLE} "
-        "('rlservo serve' writes one and prints where; 'rlservo key LABEL --admin' makes one for other servers)"
+        "('rlservo serve' writes one and prints its path; 'rlservo key LABEL --admin' makes one for other servers)"
     )

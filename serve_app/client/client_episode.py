@@ -1,4 +1,4 @@
-"""Recurrent state, last action and step count of the episode that a client is in."""
+"""Recurrent state, last action and step count of a client's current episode."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from rlservo.serve_app.client.replies import check_step, is_action, next_state
 
 
 class ClientEpisode:
-    """Episodes of a client, and a request's fields on them.
+    """Episodes of a client, and their fields in a request.
 
-    The recurrent state is here and travels with every request, or with `server_state` it stays with the server: in a
-    session of this client, or on a stream with the connection. The server needs the last action if it limits the
-    step from it; it is sent along when the server's may not be the one that the robot was commanded.
+    The recurrent state is kept here and sent with every request, or with `server_state` it stays on the server: in a
+    session of this client, or with a stream's connection. If the server limits the step from the last action, that is
+    sent whenever the server's may differ from the robot's command.
     """
 
     def __init__(self, *, server_state: bool, is_stream: bool) -> None:
         self._server_state = server_state
         self._is_stream = is_stream
         self._session_id = uuid.uuid4().hex if server_state and not is_stream else None
-        self._has_unanswered_start = False  # which may reach the server after the next one
-        self._is_limited = False  # whether the server limits the step of a policy without recurrent state
+        self._has_unanswered_start = False  # this request may reach the server after the next one
+        self._is_limited = False  # whether the server limits the step of a stateless policy
         self.reset()
 
     def reset(self) -> None:
         """Start an episode."""
         self._state: dict[str, Any] = {}  # empty at an episode's start
         self._steps = 0
-        self._last_action: Any = None  # as the server sent it
-        self._is_last_action_known = True  # whether the server has the same one
+        self._last_action: Any = None  # in the server's form
+        self._is_last_action_known = True  # whether the server has the same action
         self._is_lost = False
 
     def is_on_server(self, contract: Contract) -> bool:
@@ -48,7 +48,7 @@ class ClientEpisode:
         return bool(contract.state) and self._steps > 0
 
     def carry(self) -> None:
-        """Send a `state` from now on: the server has refused a request without one."""
+        """Send a `state` from now on, since the server has refused a request without one."""
         self._is_limited = True
 
     def set_last_action(self, action: Any) -> None:
@@ -56,16 +56,16 @@ class ClientEpisode:
         self._last_action, self._is_last_action_known = action, False
 
     def reconnect(self) -> None:
-        """Note a new connection, which does not know the episode."""
+        """Note a new connection, which has no memory of the episode."""
         self._is_last_action_known = False
         self._is_lost = self._steps > 0
 
     def request_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any]:
         """Return the next request's fields on the episode.
 
-        Until its reply came, the server may have acted with an action that no robot has seen.
+        Before its reply, the server may have decided an action that never reached the robot.
 
-        Raises SessionLostError when the recurrent state went with a connection.
+        Raises SessionLostError when the recurrent state was lost with a connection.
         """
         fields: dict[str, Any] = {}
         if self.is_on_server(contract):
@@ -80,7 +80,7 @@ class ClientEpisode:
         elif self.is_carried(contract):
             fields["state"] = self._state
         elif self._is_stream and self._steps == 0:
-            fields["reset"] = True  # of the last action, which the connection holds
+            fields["reset"] = True  # number of the last action, kept by the connection
         has_last_action = bool(fields) or self._is_stream
         if has_last_action and not self._is_last_action_known and is_action(self._last_action, batch, contract):
             fields["last_action"] = self._last_action
@@ -88,7 +88,7 @@ class ClientEpisode:
         return fields
 
     def end_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any] | None:
-        """Return the fields of the request that reports the episode's end; None if there is nothing to end.
+        """Return the fields of a request that reports the episode's end; None if there is nothing to end.
 
         Raises SessionLostError.
         """
@@ -100,15 +100,15 @@ class ClientEpisode:
         return fields
 
     def end(self) -> None:
-        """Note that the server knows the episode's end: the next one has its own session."""
+        """Note that the server knows the episode's end: the next episode gets its own session."""
         self.reset()
         if self._session_id is not None:
             self._session_id = uuid.uuid4().hex
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
-        """Continue to the next step after a reply; `action` is the reply's, as it would be sent.
+        """Advance to the next step after a reply; `action` is the reply's, in the form for sending.
 
-        Raises SessionLostError when the reply is of another episode, UnavailableError when it lacks the state.
+        Raises SessionLostError when the reply belongs to another episode, UnavailableError when it lacks the state.
         """
         self._has_unanswered_start = False
         if self.is_on_server(contract) and (contract.state or "session_step" in reply):

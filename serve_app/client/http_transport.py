@@ -1,7 +1,7 @@
-"""HTTP calls to a policy server: JSON both ways, one time budget, bounded retries, our own errors.
+"""HTTP calls to a policy server: JSON both ways, one time budget, bounded retries, rlservo's errors.
 
-A call takes `timeout_s` at most, retries and waits included, however slowly the server's bytes trickle in, and an
-answer that was not complete by then is never returned.
+A call takes `timeout_s` at most, including retries and waits, even if the server's bytes trickle in slowly; an answer
+that is incomplete by then is never returned.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from rlservo.serve_app.wire.addresses import host_of, parse_address
 from rlservo.serve_app.wire.bounded_http import FAILURES, DeadlineBackend, connection_pool
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
-try:  # three times faster than the standard library on an image; not a requirement of the client
+try:  # three times faster than the standard library for an image; optional for the client
     import orjson
 except ModuleNotFoundError:
     orjson = None  # type: ignore[assignment]
 
-FIRST_WAIT_S = 0.05  # before the second attempt; doubles each time
+FIRST_WAIT_S = 0.05  # before the second attempt; doubled each time
 LONGEST_WAIT_S = 2.0
-MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; keeps a wrong URL from filling the memory
+MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; a wrong URL must not fill the memory
 LABEL = LABEL_HEADER.encode()
 KEEPALIVE_S = 5.0  # that an idle connection is kept
 SCHEMES = {"http": "http", "https": "https"}
-PATH_CHARACTERS = "/%:@!$&'()*+,;=~"  # of a server's address, which stay as they are given
-GATEWAYS = (500, 502)  # without an error of ours: the server behind has died, which Ray's HAProxy answers with 500
+PATH_CHARACTERS = "/%:@!$&'()*+,;=~"  # of a server's address, kept as given
+GATEWAYS = (500, 502)  # without an error of ours: the server behind a proxy has died (Ray's HAProxy answers 500)
 Headers = Sequence[tuple[bytes, bytes]]
 Reply = tuple[int, Headers, bytes]  # status, headers, body
 DROPS = (httpcore.RemoteProtocolError, httpcore.ReadError, httpcore.WriteError)
@@ -51,7 +51,7 @@ class DroppedError(UnavailableError):
 
 
 class Transport:
-    """A kept-alive connection (a pool of them, when several threads call) to one server. Thread-safe."""
+    """A keep-alive connection to one server, or a pool of them if several threads call. Thread-safe."""
 
     def __init__(self, url: str, *, timeout_s: float, retries: int, api_key: str | None = None) -> None:
         """Check the arguments; nothing is sent before the first call.
@@ -67,7 +67,7 @@ class Transport:
         self._retries = retries
         parts = urlsplit(self.url)
         self._address = (parts.scheme.encode(), host_of(parts), parts.port, quote(parts.path, safe=PATH_CHARACTERS))
-        # The replies are a few hundred bytes: compressing them costs more than it saves.
+        # Replies are a few hundred bytes: compressing them costs more than it saves.
         self._headers = [
             (b"host", _host_header(parts)),
             (b"accept", b"application/json"),
@@ -82,7 +82,7 @@ class Transport:
         )
         self._is_closed = False
         self.label: str | None = None
-        """Label of the following requests, for the server's recording."""
+        """Label of later requests, for the server's recording."""
 
     @property
     def reconnects(self) -> int:
@@ -114,14 +114,14 @@ class Transport:
     def _call(
         self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None, retries: int | None
     ) -> tuple[bytes, str, int]:
-        """Try until answered, out of time or out of retries; return the content, its address and the status.
+        """Try until there is an answer, no time or no retry left; return the content, its address and the status.
 
-        Raises DeadlineError when the answer did not come in time (never retried: the server may still be at work),
-        UnavailableError when the server cannot be reached or stays at 503, or a gateway before it at 500 or 502, and
-        else the error the server names.
+        Raises DeadlineError if the answer did not come in time (never retried: the server may still be working),
+        UnavailableError if the server cannot be reached or keeps answering 503, or a gateway 500 or 502, and otherwise
+        the error that the server names.
         """
         if self._is_closed:
-            raise UsageError("the client is closed: make a new one")
+            raise UsageError("the client is closed: create a new one")
         url = "/".join((self.url, *(quote(part, safe="") for part in path)))
         scheme, host, port, prefix = self._address
         target = "/".join((prefix, *(quote(part, safe="") for part in path))) or "/"
@@ -135,7 +135,7 @@ class Transport:
             except UnavailableError as error:
                 failure = error
                 if attempt == 0 and wait is not None and isinstance(error, DroppedError):
-                    wait = 0.0  # a server that closed an idle connection is probably there
+                    wait = 0.0  # a server that closed an idle connection is probably still running
             else:
                 if status < 300:
                     return content, url, status
@@ -147,7 +147,7 @@ class Transport:
                 failure.retry_after_s = _retry_after_s(headers)
                 if wait is not None and failure.retry_after_s is not None:
                     wait = failure.retry_after_s
-            # Waiting longer than the caller is useless: report it now.
+            # A wait beyond the caller's budget is useless: report the failure now.
             if wait is None or time.monotonic() + wait >= deadline:
                 raise failure
             time.sleep(wait)
@@ -177,10 +177,10 @@ class Transport:
                         raise timeout_error
                     if len(content) > MAX_REPLY_BYTES:
                         raise TooLargeError(
-                            f"{self.url} answered more than {MAX_REPLY_BYTES >> 20} MiB: is it rlservo?"
+                            f"{self.url} sent more than {MAX_REPLY_BYTES >> 20} MiB: is it an rlservo server?"
                         )
             finally:
-                response.close()  # an unread rest closes the connection: a late answer cannot meet the next request
+                response.close()  # an unread rest closes the connection, so a late answer cannot reach the next request
         except (httpcore.ReadTimeout, httpcore.WriteTimeout) as error:
             raise timeout_error from error
         except httpcore.ConnectTimeout as error:
@@ -206,7 +206,7 @@ class Transport:
 
 
 def encode(document: Mapping[str, Any]) -> bytes:
-    """Return `document` as JSON; numpy arrays become nested lists of numbers that read back bit for bit."""
+    """Return `document` as JSON; numpy arrays become nested lists of numbers that are exact to the bit when read."""
     if orjson is not None:
         return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY, default=_plain)
     return json.dumps(document, default=_plain, allow_nan=False).encode()
@@ -219,14 +219,14 @@ def _plain(value: Any) -> Any:
 
 
 def _waits(retries: int) -> Iterator[float | None]:
-    """Yield the wait after each attempt; None after the last. Jitter keeps a fleet of robots from returning at once."""
+    """Yield the wait after each attempt; None after the last. Jitter keeps a fleet of robots from retrying at once."""
     for attempt in range(retries):
         yield min(FIRST_WAIT_S * 2**attempt, LONGEST_WAIT_S) * random.uniform(0.75, 1.25)
     yield None
 
 
 def _retry_after_s(headers: Headers) -> float | None:
-    """Return Retry-After in seconds; None when absent or a date, which no server of ours sends."""
+    """Return Retry-After in seconds; None if absent or a date, which our servers do not send."""
     try:
         seconds = float(next((value for name, value in headers if name.lower() == b"retry-after"), b""))
     except ValueError:
@@ -235,7 +235,7 @@ def _retry_after_s(headers: Headers) -> float | None:
 
 
 def _certificates() -> ssl.SSLContext:
-    """Return the certificates that servers are checked against: SSL_CERT_FILE's or SSL_CERT_DIR's, else certifi's."""
+    """Return the certificates for checking servers: SSL_CERT_FILE's or SSL_CERT_DIR's, else certifi's."""
     file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
     if file or folder:
         return ssl.create_default_context(cafile=file or None, capath=None if file else folder)

@@ -1,4 +1,4 @@
-"""Observations encoded for sending: finite numbers, nested as the space is."""
+"""Observations encoded for sending: finite numbers, nested like the space."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rlservo.serve_app.interface import Observation
 
 
 def encode_observation(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
-    """Return (the encoded observation, the batch axis as () or (B,)); the server checks shapes and names."""
+    """Return (encoded observation, batch axis as () or (B,)); the server checks shapes and names."""
     space = contract.observation_space
     if isinstance(space, DictSpec | TupleSpec):
         return _encode_part(obs, space, "obs")
@@ -42,7 +42,7 @@ def _encode_part(obs: Any, space: SpaceSpec, path: str) -> tuple[Any, tuple[int,
 
 
 def _finite_array(value: ArrayLike, where: str) -> NDArray[Any]:
-    """Return `value` as a contiguous array of finite numbers, or raise ObservationError naming the element."""
+    """Return `value` as a contiguous array of finite numbers. Raises ObservationError, which names the element."""
     try:
         array = np.ascontiguousarray(value).reshape(np.shape(value))  # ascontiguousarray makes a scalar an array of 1
     except ValueError as error:
@@ -50,7 +50,7 @@ def _finite_array(value: ArrayLike, where: str) -> NDArray[Any]:
     if array.dtype.kind not in "fiub":
         kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype.name
         raise ObservationError(f"the observation{where and f', {where},'} holds {kind}, expected numbers")
-    array = array.astype(array.dtype.newbyteorder("="), copy=False)  # orjson takes the machine's own byte order only
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)  # orjson only takes native byte order
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         first = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         which = where or f"element {first[0] if len(first) == 1 else first}"

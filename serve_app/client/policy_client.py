@@ -1,7 +1,7 @@
-"""`PolicyClient`: a policy on a server, used over HTTP like one in process.
+"""`PolicyClient`: a policy on a server, used over HTTP like a policy in process.
 
-A robot's loop gets an action that belongs to the observation it just sent, in time, or an error: every request carries
-a running number `seq`, and an answer with another number, a late one or a malformed one is never used.
+A robot's loop gets an action for the observation that it just sent, in time, or an error: every request has a sequence
+number `seq`, and an answer with another number, a late one or a malformed one is never used.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ class PolicyClient(RemotePolicy):
         action = policy.act(obs)
     ```
 
-    Without `version` each request gets what the server has in use: where `production` is moved, or a canary begins or
-    is ended, a running loop follows, if observations and actions are the same (else the answer is refused). From
-    `reset` to `reset` a canary's share is drawn once, and an episode with a recurrent state ends with the version that
-    began it. With `version` the loop stays with that one; an alias is looked up at the first request of every
+    Without `version` each request uses the version that the server has in use: if `production` moves, or a canary
+    begins or ends, a running loop follows, provided that observations and actions are the same (otherwise the answer is
+    refused). A canary's share is drawn once per `reset`, and an episode with a recurrent state ends with the version
+    that began it. With `version` the loop stays with that version; an alias is resolved at the first request of every
     episode.
 
     Thread-safe for stateless policies: threads share the connections and each gets the answer to its own request.
-    A recurrent policy's state is kept here and sent along, and so is the last action if the server limits the step
-    from it: such a client belongs to one loop, and no replica that dies takes its memory along. With `server_state` the
-    memory stays with the server instead, in a session of this client, which is worth it for large states (frames of a
-    camera) and raises SessionLostError when the server has lost it.
+    A recurrent policy's state is kept here and sent with each request, and so is the last action if the server limits
+    the step from it: such a client belongs to one loop, and its memory survives a replica's death. With `server_state`
+    the memory stays on the server instead, in a session of this client, which saves sending large states (camera
+    frames) and raises SessionLostError if the server has lost it.
     """
 
     def __init__(
@@ -60,13 +60,13 @@ class PolicyClient(RemotePolicy):
         record: str | Path | Recorder | None = None,
         label: str | None = None,
     ) -> None:
-        """Check the arguments; the server is first asked when `contract` or `act` needs it.
+        """Check the arguments; the first request is sent when `contract` or `act` needs it.
 
-        `policy` may be None if the server has exactly one. `timeout_s` bounds one call, its retries included, and
-        `deadline_ms` instead of it each `act`; `retries` counts further attempts after a failed connection or a 503,
+        `policy` may be None if the server has exactly one. `timeout_s` bounds one call including its retries;
+        `deadline_ms` replaces it for each `act`. `retries` counts further attempts after a failed connection or a 503;
         nothing else is ever sent twice. `record` keeps every decision: a new .mcap file, a folder, or a Recorder.
-        `label` names this loop: in the server's own recording, what it asks from `reset` to `reset` is one episode,
-        with a random name if there is no label. Threads that share a client share its episode.
+        `label` names this loop: in the server's own recording, its requests between two `reset`s are one episode, with
+        a random name if there is no label. Threads that share a client share its episode.
         """
         if label is not None and not (label and label.isascii() and label.isprintable() and len(label) <= 100):
             raise UsageError(f"label must be 1 to 100 printable ASCII characters, got {label[:100]!r}")
@@ -92,7 +92,7 @@ class PolicyClient(RemotePolicy):
         """Start an episode: the next request carries it. Sends nothing."""
         super().reset()
         self._begin_label()
-        # A version's number leads to itself.
+        # A version number needs no lookup.
         known = self._contract
         self._looks_up = self._version is not None and known is not None and self._version != known.version
 
@@ -110,7 +110,7 @@ class PolicyClient(RemotePolicy):
         except StateNeededError:
             if self._episode.is_carried(contract) or self._episode.is_on_server(contract):
                 raise
-            # Nothing in the contract says that the server limits the step from one action to the next.
+            # The contract does not say whether the server limits the step from one action to the next.
             self._episode.carry()
             request["seq"] = number = next(self._numbers)
             fields = self._episode.request_fields(contract, batch)
@@ -131,7 +131,7 @@ class PolicyClient(RemotePolicy):
     def _post(self, request: dict[str, Any], deadline_ms: float) -> Any:
         """Send a request for an action and return the reply."""
         contract = self.contract
-        # The server drops what it could not answer in time, instead of working through a queue of abandoned questions.
+        # The server drops requests that would be late, instead of working through a queue of abandoned ones.
         body = encode({**request, "deadline_ms": deadline_ms})
         version = () if self._version is None else ("versions", contract.version)
         return self._transport.post(
@@ -154,10 +154,10 @@ class PolicyClient(RemotePolicy):
 
 
 def _only_policy(listing: Any) -> str:
-    """Return the name of the server's one policy, or raise an error that lists them."""
+    """Return the name of the server's only policy, or raise an error that lists all of them."""
     policies = listing.get("policies") if isinstance(listing, dict) else None
     if not isinstance(policies, list):
-        raise UnavailableError("the server's list of policies cannot be read: is it another version of rlservo?")
+        raise UnavailableError("the server's list of policies cannot be read: does it run another version of rlservo?")
     names = sorted({str(entry["name"]) for entry in policies if isinstance(entry, dict) and "name" in entry})
     if not names:
         raise UnknownPolicyError("the server has no policy loaded")

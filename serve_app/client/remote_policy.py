@@ -1,8 +1,8 @@
 """Base of the HTTP and the WebSocket client of a policy: contract, episode, recording, arguments of a request.
 
-A client that was given no version asks by the policy's name and follows what the server answers with: the alias
-`production`, and a canary's share, as all clients do. A policy with memory stays with the version that began the
-episode (the server sees to that), and an answer of a version with other spaces is never used.
+A client without a version asks by the policy's name and follows the version that answers: the alias `production`, or a
+canary's share. A recurrent policy stays with the version that began the episode (the server ensures that), and an
+answer from a version with other spaces is never used.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-POLL_S = 0.1  # between two looks at a server that is starting
-LONGEST_TRY_S = 5.0  # of one such look
-FOLLOWED_S = 2.0  # by all processes of a server, when a version is loaded
-ASK_AGAIN_S = 0.01  # another process may be the next to answer
+POLL_S = 0.1  # between two checks of a server that is starting
+LONGEST_TRY_S = 5.0  # of one such check
+FOLLOWED_S = 2.0  # until all processes of a server have loaded a version
+ASK_AGAIN_S = 0.01  # another process may answer next
 
 
 class RemotePolicy(ActingPolicy):
@@ -59,13 +59,13 @@ class RemotePolicy(ActingPolicy):
         episode: ClientEpisode,
         record: str | Path | Recorder | None,
     ) -> None:
-        """Check the arguments, then open the recording: a client that cannot be made leaves no file behind."""
+        """Check the arguments, then open the recording, so that a failing constructor leaves no file behind."""
         if not timeout_s > 0:
             raise UsageError(f"timeout_s must be above 0 seconds, got {timeout_s}")
         if deadline_ms is not None and not deadline_ms > 0:
             raise UsageError(f"deadline_ms must be above 0, got {deadline_ms}")
         if policy == "":
-            raise UsageError("the policy's name is empty: give a name, or None if the server has only one policy")
+            raise UsageError("the policy name is empty: give a name, or None if the server has only one policy")
         if version is not None and policy is None:
             raise UsageError(f"version {version!r} was given without the policy's name")
         self._name = policy
@@ -75,11 +75,11 @@ class RemotePolicy(ActingPolicy):
         self._episode = episode
         self._contract: Contract | None = None
         self._looks_up = False
-        """Whether the contract is fetched again before the next request: of an alias, which may have moved."""
+        """Whether the contract is fetched again before the next request, because its alias may have moved."""
         self._contracts: dict[str, Contract] = {}
-        """Contracts of every version that has answered."""
+        """Contracts of all versions that have answered."""
         self._reward: float | None = None
-        """Result of the last action, for the next request."""
+        """Outcome of the last action, for the next request."""
         self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
         self.last_reply: dict[str, Any] = {}
         """The server's reply to the last request that got an action."""
@@ -87,7 +87,7 @@ class RemotePolicy(ActingPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The contract of the version that answered last; before the first answer, of the server's default.
+        """The contract of the version that answered last or, before the first answer, of the server's default.
 
         Raises UnavailableError, DeadlineError, UnknownPolicyError, or UsageError when no policy was named and the
         server has several.
@@ -104,8 +104,8 @@ class RemotePolicy(ActingPolicy):
 
         Raises ObservationError (non-finite numbers are refused here, the rest by the server), ActionError when the
         answer is not an action of this policy, DeadlineError after `deadline_ms`, UnavailableError when the server
-        cannot be reached, is not ready, or answers another request than this one, and SessionLostError when it kept the
-        episode's state and has lost it.
+        cannot be reached, is not ready, or answers a different request, and SessionLostError when it has lost the
+        episode's state.
         """
         act = self._act if self._recording is None else self._recording.act
         return act(obs, explore=explore, seed=seed, reward=reward)
@@ -121,10 +121,9 @@ class RemotePolicy(ActingPolicy):
     ) -> None:
         """Report the last action's reward and the episode's end to the server and the client's recording.
 
-        A reward is sent with the next request, an episode's end by itself, where `final_obs`, the observation after the
-        last action, is given: a server that records keeps them, and `rlservo policy promote` counts what ended in
-        `success`. A server that does not take it is logged, and no reason to stop. Nothing to do before the first
-        action.
+        A reward is sent with the next request, an episode's end in a request of its own if `final_obs`, the observation
+        after the last action, is given: a server that records keeps them, and `rlservo policy promote` counts ends in
+        `success`. If the server refuses it, that is only logged. Does nothing before the first action.
         """
         if self._recording is not None:
             self._recording.record_outcome(
@@ -142,22 +141,22 @@ class RemotePolicy(ActingPolicy):
             if fields is not None:
                 self._tell_end({**request, **fields, **end})
         except RlservoError as error:
-            logger.warning("%s does not know how the episode ended: %s", self.url, error.message)
+            logger.warning("the end of the episode was not reported to %s: %s", self.url, error.message)
         self._reward = None
         self._episode.end()
 
     def set_last_action(self, action: Any) -> None:
         """Note the robot's command instead of a missing answer. Sends nothing.
 
-        The next request says so, and a limit on the step from one action to the next (`max_action_step`) counts from
-        there. `action` is as `act` returns it.
+        It is sent with the next request, and a limit on the step from one action to the next (`max_action_step`) counts
+        from it. `action` has the form that `act` returns.
         """
         self._episode.set_last_action(action)
         if self._recording is not None:
             self._recording.record_command(action)
 
     def reset(self) -> None:
-        """Start an episode: the next request carries it. Sends nothing."""
+        """Start an episode. Nothing is sent until the next request."""
         self._episode.reset()
         self._reward = None
         if self._recording is not None:
@@ -170,10 +169,10 @@ class RemotePolicy(ActingPolicy):
         self._close()
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
-        """Return as soon as the server offers the policy.
+        """Wait until the server offers the policy.
 
-        Raises UnavailableError with the last reason after `timeout_s`, and at once errors that waiting cannot cure,
-        such as UnknownPolicyError.
+        Raises UnavailableError with the last reason after `timeout_s`; errors that waiting cannot cure, such as
+        UnknownPolicyError, are raised at once.
         """
         deadline = time.monotonic() + timeout_s
         while self._contract is None:
@@ -189,7 +188,7 @@ class RemotePolicy(ActingPolicy):
 
     @abstractmethod
     def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
-        """Ask the server for the action, and keep its reply as `last_reply`."""
+        """Request the action, and keep the reply as `last_reply`."""
         ...
 
     @abstractmethod
@@ -204,23 +203,23 @@ class RemotePolicy(ActingPolicy):
 
     @abstractmethod
     def _fetch_contract(self, timeout_s: float | None) -> Contract:
-        """Ask the server for the contract: with a time-out once, else as often as the client asks anything."""
+        """Request the contract: once if there is a time-out, otherwise with the client's usual retries."""
         ...
 
     @abstractmethod
     def _fetch_version(self, version: str, deadline: float) -> Contract:
-        """Ask the server for the contract of a version, by `deadline` (`time.monotonic`)."""
+        """Request the contract of a version, by `deadline` (`time.monotonic`)."""
         ...
 
     def _meet(self, contract: Contract) -> None:
-        """Use this contract for the version that answers from now on. Raises UnavailableError."""
+        """Use this contract from now on. Raises UnavailableError."""
         self._learn(contract)
         if self._contract is not None and contract is not self._contract:
             check_successor(contract, self._contract)
         self._contract, self._looks_up = contract, False
 
     def _learn(self, contract: Contract) -> None:
-        """Keep the contract of a version; warn if it was made for another control rate."""
+        """Store the contract of a version; warn if it was made for another control rate."""
         known = self._contract
         if contract.version not in self._contracts and known and known.control_rate_hz != contract.control_rate_hz:
             logger.warning(
@@ -232,7 +231,7 @@ class RemotePolicy(ActingPolicy):
     def _answering_contract(self, reply: Any, number: int, deadline: float) -> Contract:
         """Return the contract of the version that answered request `number`.
 
-        Raises UnavailableError if it is the answer to another request, or of a version that this client was not made
+        Raises UnavailableError if it answers another request, or comes from a version that this client was not made
         for, and DeadlineError.
         """
         contract = self.contract
@@ -252,12 +251,12 @@ class RemotePolicy(ActingPolicy):
                     f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' but has no contract "
                     "for it: the action was dropped"
                 )
-            self._learn(known)  # also one that is refused next: it is not fetched again
+            self._learn(known)  # kept even if it is refused next, so that it is not fetched again
         self._meet(known)
         return known
 
     def _fetch_new_version(self, version: str, deadline: float) -> Contract:
-        """Return the contract of a version that has answered, even if another process does not serve it yet."""
+        """Return the contract of a version that has answered, even if other processes do not serve it yet."""
         until = min(deadline, time.monotonic() + FOLLOWED_S)
         while True:
             try:
@@ -284,11 +283,11 @@ class RemotePolicy(ActingPolicy):
         return request, batch
 
     def _parse_contract(self, document: Any) -> Contract:
-        """Return the contract that the server sent; raise UnavailableError if it cannot be one."""
+        """Return the contract that the server sent. Raises UnavailableError if it is not one."""
         try:
             return Contract.model_validate(document)
         except ValidationError as error:
             raise UnavailableError(
                 f"{self.url} sent a contract that this client cannot read: {first_fault(error)} "
-                "(is the server another version of rlservo?)"
+                "(does the server run another version of rlservo?)"
             ) from error

@@ -1,4 +1,4 @@
-"""Replies of a server: checked that they answer this request and fit the contract; errors raised as the server did."""
+"""Checks that a server's reply answers this request and fits the contract; errors raised as the server did."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from rlservo.serve_app.wire.request_names import MARK
 
 
 def decode_error(url: str, status: int, content: bytes) -> RlservoError:
-    """Return the error in the body of an HTTP reply that is not a success."""
+    """Return the error in the body of a failed HTTP reply."""
     try:
         document = json.loads(content)
     except ValueError:
@@ -36,12 +36,12 @@ def decode_error(url: str, status: int, content: bytes) -> RlservoError:
     if error is not None:
         return error
     if status == 404:  # Ray Serve's own answer while the application is being deployed
-        return UnavailableError(f"{url} answered 404 with {excerpt(content)}: no rlservo server is there (yet)")
+        return UnavailableError(f"{url} answered 404 with {excerpt(content)}: no rlservo server is running there yet")
     return _class_of_status(status)(f"{url} answered {status} with {excerpt(content)}: is it an rlservo server?")
 
 
 def error_of(document: Any, status: int) -> RlservoError | None:
-    """Return the error in `{"error", "code", "details"?}`; None if the document is not that."""
+    """Return the error in `{"error", "code", "details"?}`; None for any other document."""
     if not isinstance(document, dict) or not isinstance(document.get("error"), str):
         return None
     details = document.get("details")
@@ -53,7 +53,7 @@ def error_of(document: Any, status: int) -> RlservoError | None:
 
 
 def excerpt(content: bytes) -> str:
-    """Return the beginning of a body, to be shown in a message."""
+    """Return the beginning of a body for a message."""
     text = content[:80].decode("utf-8", "replace")
     return f"{text!r}{'...' if len(content) > 80 else ''}" if text else "an empty body"
 
@@ -64,13 +64,13 @@ def _classes() -> dict[str, type[RlservoError]]:
     queue: list[type[RlservoError]] = [RlservoError]
     while queue:
         kind = queue.pop(0)
-        classes.setdefault(kind.code, kind)  # a class comes before those that inherit its code
+        classes.setdefault(kind.code, kind)  # a class precedes those that inherit its code
         queue += kind.__subclasses__()
     return classes
 
 
 def _class_of_status(status: int) -> type[RlservoError]:
-    """Return the error for an answer that carries no code of ours, a proxy's for example."""
+    """Return the error for an answer without one of our codes, for example a proxy's."""
     if status in (401, 403):
         return UsageError
     if status in (408, 504):
@@ -81,7 +81,7 @@ def _class_of_status(status: int) -> type[RlservoError]:
 
 
 def answering_version(url: str, reply: Any, number: int, contract: Contract) -> str:
-    """Return the version that answered; refuse an answer to another request or from another policy."""
+    """Return the version that answered. Refuses an answer to another request or from another policy."""
     if not isinstance(reply, dict):
         raise UnavailableError(f"{url} answered with {type(reply).__name__}, expected an object")
     if reply.get("seq") != number:
@@ -99,7 +99,7 @@ def answering_version(url: str, reply: Any, number: int, contract: Contract) -> 
 
 
 def check_successor(contract: Contract, known: Contract) -> None:
-    """Refuse a version whose observation or action differs from the known one's."""
+    """Refuse a version whose observations or actions differ from those of the known one."""
     for word, key in (("observation", "obs"), ("action", "action")):
         theirs, ours = (leaf_specs(getattr(each, f"{word}_space"), key) for each in (contract, known))
         if theirs != ours or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
@@ -116,28 +116,28 @@ def check_successor(contract: Contract, known: Contract) -> None:
         takes = ("does not take", "takes")
         raise UnavailableError(
             f"version {contract.version} of policy '{contract.name}' answers now and {takes[has_reward]} the reward; "
-            f"version {known.version}, which this client knows, {takes[had_reward]} it: the action was dropped; make a "
-            "new client, or one with version=",
+            f"version {known.version}, which this client knows, {takes[had_reward]} it: the action was dropped; create "
+            "a new client, or one with version=",
             {"version": contract.version, "known": known.version, "differing": [REWARD]},
         )
 
 
 def check_step(reply: Mapping[str, Any], steps: int) -> int:
-    """Return how many steps the server's memory has come; raise SessionLostError unless it comes from this episode.
+    """Return the step count of the server's memory. Raises SessionLostError unless it belongs to this episode.
 
-    It may be ahead: a step whose answer came too late, or was refused here, has moved it on nevertheless.
+    It may be ahead: a step whose answer was late, or was refused here, has advanced it nevertheless.
     """
     step = reply.get("session_step")
     if type(step) is not int or step <= steps or (steps == 0 and step != 1):
         raise SessionLostError(
-            f"the server's memory is at step {step!r} of an episode, expected one after {steps}: it is not this "
-            "episode's; call reset() to begin one"
+            f"the server's memory is at step {step!r} of an episode, expected one after {steps}: it belongs to another "
+            "episode; call reset() to begin one"
         )
     return step
 
 
 def next_state(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
-    """Return the state for the next request; raise UnavailableError if the server gave none."""
+    """Return the state for the next request. Raises UnavailableError if the server sent none."""
     state = reply.get("state")
     if state is None and not contract.state:
         return {}  # the state need not be carried any more
@@ -159,7 +159,7 @@ def decode_action(action: Any, batch: tuple[int, ...], contract: Contract) -> An
 
 
 def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
-    """Whether this is an action of the policy for so many observations."""
+    """Return whether this is an action of the policy for this number of observations."""
     try:
         decode_action(action, batch, contract)
     except ActionError:

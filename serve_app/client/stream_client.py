@@ -1,7 +1,7 @@
 """`StreamClient`: a policy on a server over one WebSocket, used like `PolicyClient`.
 
-A stream saves the HTTP around each request. It reconnects automatically when it breaks, and whatever comes late is
-known by its number and never used.
+A stream saves the HTTP overhead of each request. It reconnects automatically, and late answers are recognised by their
+number and never used.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 SCHEMES = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}
 WAIT_S = 0.02  # between two attempts to connect within one call
-SILENT_FACTOR, SILENT_S = 3.0, 0.5  # a connection that gave no byte for so many deadlines, and so long, is replaced
+SILENT_FACTOR, SILENT_S = 3.0, 0.5  # a connection without any data for this many deadlines, and this long, is replaced
 
 
 class StreamClient(RemotePolicy):
@@ -51,9 +51,9 @@ class StreamClient(RemotePolicy):
         action = policy.act(obs)
     ```
 
-    Which version answers is as with `PolicyClient`; a canary's share is drawn once for the client. A recurrent policy's
-    state is kept here and sent along, or with `server_state` left with the connection: when that breaks in the middle
-    of an episode the state is gone, and `act` raises SessionLostError until `reset`. It belongs to one loop, and is not
+    Versions are chosen as for `PolicyClient`; a canary's share is drawn once per client. A recurrent policy's state is
+    kept here and sent with each request, or with `server_state` stays with the connection: if that breaks in the middle
+    of an episode the state is lost, and `act` raises SessionLostError until `reset`. It belongs to one loop, and is not
     thread-safe.
     """
 
@@ -71,8 +71,8 @@ class StreamClient(RemotePolicy):
     ) -> None:
         """Check the arguments; nothing is sent before `contract` or `act` needs it.
 
-        `policy` may be None if the server has a default policy. `timeout_s` bounds the first contact, `deadline_ms`
-        (by default the same) each `act`, which also replaces a broken connection. `record` keeps every decision: a
+        `policy` may be None if the server has a default policy. `timeout_s` bounds the first contact, `deadline_ms` (by
+        default the same) each `act`, including the replacement of a broken connection. `record` keeps every decision: a
         new .mcap file, a folder, or a Recorder.
         """
         self.url = parse_address(url, SCHEMES)
@@ -90,7 +90,7 @@ class StreamClient(RemotePolicy):
         self._is_closed = False
         self._connections = 0
         self.stale = 0
-        """Answers that came after their deadline, and were dropped."""
+        """Answers that came after their deadline and were dropped."""
 
     @property
     def reconnects(self) -> int:
@@ -114,9 +114,9 @@ class StreamClient(RemotePolicy):
                 self._disconnect()
                 if time.monotonic() + WAIT_S >= deadline:
                     raise
-                continue  # asking twice does no harm: no memory of ours has survived on the other side
+                continue  # asking twice is harmless: the server has not kept any memory of ours
             except StateNeededError:
-                self._disconnect()  # of another version than the connection began with: the next one sends its contract
+                self._disconnect()  # the version has changed: the next connection sends its contract
                 version = contract.version
                 self._connected(deadline)
                 if self.contract.version == version:
@@ -132,7 +132,7 @@ class StreamClient(RemotePolicy):
             try:
                 contract = self._answering_contract(reply, number, deadline)
             except _UnmetVersionError:
-                self._disconnect()  # the next connection begins with its contract
+                self._disconnect()  # the next connection starts with its contract
                 if time.monotonic() + WAIT_S >= deadline:
                     raise
                 continue
@@ -159,7 +159,7 @@ class StreamClient(RemotePolicy):
         self._is_closed = True
 
     def _receive_reply(self, connection: WebSocket, number: int, deadline: float) -> dict[str, Any]:
-        """Return the reply to request `number`; those to earlier ones are dropped."""
+        """Return the reply to request `number`; replies to earlier requests are dropped."""
         while True:
             message = connection.receive(deadline)
             try:
@@ -189,7 +189,7 @@ class StreamClient(RemotePolicy):
         return self._socket
 
     def _connect(self, deadline: float) -> Contract:
-        """Open a connection and return the contract that comes first on it."""
+        """Open a connection and return the contract that it starts with."""
         if self._is_closed:
             raise UsageError("the client is closed: make a new one")
         name, version = self._name, self._version
@@ -203,7 +203,7 @@ class StreamClient(RemotePolicy):
         return contract
 
     def _open(self, url: str, name: str | None, version: str | None, deadline: float) -> tuple[WebSocket, Contract]:
-        """Return (an open connection to a policy, the contract that came first on it)."""
+        """Return (an open connection to a policy, the contract that it started with)."""
         path = "/" if name is None else f"/v1/policies/{quote(name, safe='')}"
         path += f"/versions/{quote(version, safe='')}/stream" if version else "/stream" if name else ""
         try:
@@ -225,7 +225,7 @@ class StreamClient(RemotePolicy):
         raise _UnmetVersionError(f"{self.url} answered for version {version[:32]!r}: the action was dropped")
 
     def _receive_contract(self, connection: WebSocket, deadline: float) -> Contract:
-        """Return the contract in the metadata, the first thing a server sends."""
+        """Return the contract in the metadata, which a server sends first."""
         message = connection.receive(deadline)
         try:
             metadata = None if isinstance(message, str) else unpack(message)
@@ -242,11 +242,11 @@ class StreamClient(RemotePolicy):
 
 
 class _UnmetVersionError(UnavailableError):
-    """A version answered whose contract has not arrived on any connection yet."""
+    """The contract of the version that answered has not arrived on any connection yet."""
 
 
 def _first_of_chunk(chunks: Any, contract: Contract, batch: tuple[int, ...]) -> Any:
-    """Return the action without the chunk axis of each leaf: ours are chunks of one. Raises ActionError."""
+    """Return the action without the chunk axis of each leaf; our chunks have one action. Raises ActionError."""
     leaves: dict[str, Any] = {}
     try:
         for name, chunk in action_leaves(contract.action_space, chunks).items():

@@ -1,7 +1,7 @@
 """WebSocket connection to a policy server: binary frames, each sent and read within a deadline.
 
-The protocol is the package `websockets`' own, without its input and output: here is a plain socket whose every
-operation ends at the deadline it is given, whatever arrives meanwhile: nothing, half a frame, bytes one at a time.
+The package `websockets` provides the protocol without input and output. Here is a plain socket whose operations all end
+at the given deadline, even if nothing arrives, half a frame, or one byte at a time.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ with needs_extra("client", what="the WebSocket client"):
     from websockets.http11 import Response
     from websockets.uri import parse_uri
 
-MAX_FRAME_BYTES = 64 << 20  # far above any action or contract
+MAX_FRAME_BYTES = 64 << 20  # larger than any action or contract
 RECEIVE_BYTES = 65536
 
 
@@ -33,7 +33,7 @@ class WebSocket:
     def __init__(self, url: str, *, api_key: str | None, deadline: float, label: str) -> None:
         """Connect and shake hands by `deadline` (`time.monotonic`).
 
-        `label` names the connection's owner: when a canary runs, all of a label get the same version.
+        `label` names the connection's owner: during a canary, all connections with one label get the same version.
 
         Raises BrokenError, or HandshakeError when the server answers with an HTTP error.
         """
@@ -63,7 +63,7 @@ class WebSocket:
             if isinstance(failure, InvalidStatus):
                 raise HandshakeError(failure.response.status_code, bytes(failure.response.body or b""))
             if isinstance(failure, InvalidHandshake):
-                raise BrokenError(f"{url} is not a stream: {failure}: is it an rlservo server?")
+                raise BrokenError(f"{url} is not a stream ({failure}): is it an rlservo server?")
             if failure is not None:
                 raise BrokenError(f"{url} dropped the connection: {failure}")
         except (OSError, ssl.SSLError) as error:
@@ -84,17 +84,17 @@ class WebSocket:
             self._protocol.send_binary(content)
             self._flush(deadline)
         except TimeoutError:
-            self.close()  # half a frame is on its way: nothing can follow it
+            self.close()  # half a frame has been sent: nothing can follow it
             raise DeadlineError(f"{self._url} did not take the request in time") from None
-        except Exception as error:  # the protocol's own refuse to send on a closed connection
+        except Exception as error:  # the protocol refuses to send on a closed connection
             self.close()
             raise BrokenError(f"{self._url} dropped the connection: {error}") from error
 
     def receive(self, deadline: float) -> bytes | str:
         """Return the next message.
 
-        Raises DeadlineError when it was not complete in time (the connection stays, and a later call
-        continues), or BrokenError when the connection is gone.
+        Raises DeadlineError if it was not complete in time (the connection stays open, and a later call continues), or
+        BrokenError if the connection is lost.
         """
         while True:
             while self._events:
@@ -104,7 +104,7 @@ class WebSocket:
             try:
                 self._receive_bytes(deadline)
                 self._events += self._protocol.events_received()
-                self._flush(deadline)  # the answer to a ping, or to a close
+                self._flush(deadline)  # the reply to a ping or a close
             except TimeoutError:
                 raise DeadlineError(f"{self._url} did not answer in time") from None
             except OSError as error:
@@ -116,7 +116,7 @@ class WebSocket:
                 raise BrokenError(f"{self._url} closed the connection (code {code})")
 
     def close(self) -> None:
-        """Close, with a close frame if that takes no time."""
+        """Close, with a close frame if it can be sent without waiting."""
         with contextlib.suppress(Exception):
             self._protocol.send_close(1000)
             self._flush(time.monotonic() + 0.05)
@@ -152,7 +152,7 @@ class WebSocket:
 
 
 class BrokenError(UnavailableError):
-    """The connection is missing or closed: another one may be made."""
+    """The connection is missing or closed: a new one may be opened."""
 
     code = "connection-broken"
 

@@ -1,9 +1,9 @@
-"""Autoscaling by processor time: as many replicas as keep each one's load within reason.
+"""Autoscaling by processor time: enough replicas to keep the load of each moderate.
 
-Ray Serve counts requests that are being worked on. A policy's request is over before anybody counts it, so a replica at
-its limit looks idle, while one with a hundred silent streams looks busy; hence this measure instead. In serve.yaml:
+Ray Serve counts requests in progress. A policy's request is over before it is counted, so a replica at its limit looks
+idle, while one with a hundred silent streams looks busy; hence this measure instead. In serve.yaml:
 `autoscaling_config: {policy: {policy_function: rlservo.serve_app.engines.autoscaling:by_load}, ...}`. It imports
-nothing of Ray: Serve's controller imports it.
+nothing from Ray: Serve's controller imports it.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from pathlib import Path
 from typing import Any
 
 BUSY = "busy"
-TARGET = 0.6  # share of one core per replica; above it, what arrives together waits noticeably for each other
-ENOUGH = 0.45  # a replica less only if the others stay below this: no to and fro
+TARGET = 0.6  # share of one core per replica; above it, simultaneous requests noticeably delay each other
+ENOUGH = 0.45  # one replica less only if the others stay below this, to avoid oscillation
 
 
 class Load:
     """Share of the time in which this process's busiest thread wanted a core, whether it got one or not.
 
-    Time on the processor alone looks modest exactly when the machine is overloaded.
+    Processor time looks modest exactly when the machine is overloaded.
     """
 
     def __init__(self) -> None:
         self._wall, self._wanted = time.perf_counter(), _wanted_by_thread()
 
     def measure(self) -> float:
-        """Return the share since the last measurement, between 0 and 1, and begin the next one."""
+        """Return the share since the last measurement, between 0 and 1, and start the next one."""
         wall, wanted = time.perf_counter(), _wanted_by_thread()
         most = max((seconds - self._wanted.get(thread, 0.0) for thread, seconds in wanted.items()), default=0.0)
         share = most / max(wall - self._wall, 1e-3)
@@ -38,7 +38,7 @@ class Load:
 
 
 def _wanted_by_thread() -> dict[str, float]:
-    """Return the seconds each thread of this process ran or waited to run (only ran, if Linux reports no waiting)."""
+    """Return the seconds that each thread ran or waited to run (only ran, if Linux reports no waiting)."""
     found = {}
     for file in Path("/proc/self/task").glob("*/schedstat"):
         with contextlib.suppress(OSError, ValueError):  # a thread may end meanwhile

@@ -21,7 +21,7 @@ MAX_CALLS = 1024
 
 
 class GrpcServer:
-    """Serves gRPC calls of one process."""
+    """Serves one process's gRPC calls."""
 
     def __init__(self, handler: RequestHandler, host: str, port: int, *, is_shared: bool) -> None:
         """`is_shared`: whether several processes listen on the port, which the kernel then shares out."""
@@ -42,13 +42,13 @@ class GrpcServer:
         methods["ModelStreamInfer"] = grpc.stream_stream_rpc_method_handler(self._stream)
         self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
         service: Any = health  # its asyncio part is not in its type stubs
-        self._health = service.aio.HealthServicer()  # what orchestrators probe, without a key
+        self._health = service.aio.HealthServicer()  # probed by orchestrators, without a key
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         if settings.grpc_reflection:
             _add_reflection(self._server)
 
     async def start(self) -> None:
-        """Listen, and report to be serving. Raises UnavailableError if the port cannot be listened on."""
+        """Listen, and report the health status "serving". Raises UnavailableError if it cannot listen on the port."""
         try:
             self._server.add_insecure_port(self._address)
         except RuntimeError as error:
@@ -58,7 +58,7 @@ class GrpcServer:
             await self._health.set(service, health_pb2.HealthCheckResponse.SERVING)
 
     async def stop(self) -> None:
-        """Report not to be serving, and end when the calls in progress are answered."""
+        """Report the health status "not serving", and end once the calls in progress are answered."""
         await self._health.enter_graceful_shutdown()
         await self._server.stop(DRAIN_S)
 

@@ -1,9 +1,9 @@
 """Bounds on HTTP connections and WebSockets: heads, bodies, trailers, pipelining, pings, connections of one address.
 
-uvicorn (0.54) waits indefinitely for a request's head and body, reads heads and trailers of any size, takes a trailer
-for a header, queues any number of pipelined requests, and answers pings of a client that reads nothing. `BoundedHttp`
-and `BoundedWebSocket` are uvicorn's connections with limits, given to uvicorn by its options `http` and `ws`. They
-override methods of `asyncio.Protocol`, callbacks of httptools' parser and uvicorn's handlers of frames.
+uvicorn (0.54) waits indefinitely for a request's head and body, reads heads and trailers of any size, treats a trailer
+as a header, queues any number of pipelined requests, and answers pings of a client that reads nothing. `BoundedHttp`
+and `BoundedWebSocket` are uvicorn's connections with limits, passed in its options `http` and `ws`. They override
+methods of `asyncio.Protocol`, callbacks of httptools' parser and uvicorn's frame handlers.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
 LIMITS = "rlservo.limits"  # in the application's lifespan state, which uvicorn hands to each connection
 HEAD_S = 5.0  # [s] for a request's head, from the connection's start or the head's first byte
-MAX_HEAD_BYTES = 16384  # of a head, and of trailers
+MAX_HEAD_BYTES = 16384  # of a head, or of trailers
 MAX_PIPELINED = 32  # requests that a connection may send before the first one is answered
 MAX_CONNECTIONS = 4096  # of one process
-SPARE = 32  # connections of an address beyond its bound that are answered 429; further ones are closed at once
+SPARE = 32  # connections from an address beyond its bound that get 429; further ones are closed at once
 UNREAD_MS = 30_000  # [ms] that a client may leave a reply unread
-SLICE_BYTES = 4096  # of a WebSocket's data, read before its bounds are checked again
-LINGER_S = 5.0  # [s] that a refused client may still send what is dropped
+SLICE_BYTES = 4096  # of a WebSocket's data that is read before its bounds are checked again
+LINGER_S = 5.0  # [s] for which a refused client's further data is read and dropped
 MAX_UNANSWERED = 64  # messages of a WebSocket
-MAX_FRAMES = 1000  # pings, pongs and fragments of a WebSocket in a second
-VIOLATION = 1008  # WebSocket's close code for a client that does not keep to what a server allows
+MAX_FRAMES = 1000  # pings, pongs and fragments of a WebSocket per second
+VIOLATION = 1008  # WebSocket's close code for a client that violates the server's rules
 ERROR_CODES = {
     400: RequestError.code,
     408: DeadlineError.code,
     429: OverloadedError.code,
     431: RequestError.code,
 }
-CHECK_S = 1.0  # [s] between two looks at a connection's phase
+CHECK_S = 1.0  # [s] between two checks of a connection's phase
 
 
 class ConnectionLimits:
@@ -56,13 +56,13 @@ class ConnectionLimits:
         self._handler = handler
 
     def record(self, status: int, sentence: str, peer: str | None) -> None:
-        """Count and log what was refused before the application had it."""
+        """Count and log a request that was refused before the application got it."""
         request = Request("http", "", None, time.perf_counter())
         self._handler.record_failure(request, ERROR_CODES[status], sentence, peer=peer)
 
 
 class _Refused(Exception):
-    """A request is refused by the parser's callback; httptools and uvicorn answer 400 for any exception of one."""
+    """A request is refused in a callback of the parser; httptools and uvicorn answer 400 for any exception in one."""
 
 
 class BoundedHttp(HttpToolsProtocol):
@@ -91,7 +91,7 @@ class BoundedHttp(HttpToolsProtocol):
         """Count the connection, and begin to wait for the first head."""
         super().connection_made(transport)
         connection = transport.get_extra_info("socket")
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel ends it when a reply stays unread, a WebSocket's too
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel closes it if a reply stays unread, also on a WebSocket
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
         self._check_timer = self.loop.call_later(CHECK_S, self._check)
         excess = self._excess()
@@ -101,7 +101,7 @@ class BoundedHttp(HttpToolsProtocol):
             self.app = self._refuse_connection
 
     def _excess(self) -> int:
-        """Return by how many connections this one's address, or all together, are beyond the bound."""
+        """Return the number of connections by which this address, or the process, exceeds its bound."""
         total = len(self.connections) - MAX_CONNECTIONS
         if not self._limits.per_address or self.client is None or len(self.connections) <= self._limits.per_address:
             return total
@@ -115,12 +115,12 @@ class BoundedHttp(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def handle_websocket_upgrade(self) -> None:
-        """Leave the connection to the WebSocket, which has bounds of its own."""
+        """Hand the connection over to the WebSocket, which has its own bounds."""
         self._stop_checks()
         super().handle_websocket_upgrade()
 
     def data_received(self, data: bytes) -> None:
-        """Read what came; of a head no more than may come."""
+        """Read the data; of a head, no more than is allowed."""
         super().data_received(data)
         if not self._in_body and self._phase_limit_s is not None:
             self._head_bytes += len(data)
@@ -130,13 +130,13 @@ class BoundedHttp(HttpToolsProtocol):
     # Callbacks of the parser
 
     def on_message_begin(self) -> None:
-        """Begin to wait for a head."""
+        """Start to wait for a head."""
         super().on_message_begin()
         self._await(HEAD_S)
         self._head_bytes = 0
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Take a header. What comes after the body is a trailer: it is ignored, and bounded."""
+        """Take a header. After the body it is a trailer, which is ignored and bounded."""
         if not self._in_body:
             super().on_header(name, value)
             return
@@ -145,7 +145,7 @@ class BoundedHttp(HttpToolsProtocol):
             self._refuse("the request's trailers are too large")
 
     def on_headers_complete(self) -> None:
-        """Begin to wait for the body."""
+        """Start to wait for the body."""
         parser: Any = self.parser
         if parser.should_upgrade():
             self._check_upgrade(parser.get_method())
@@ -163,7 +163,7 @@ class BoundedHttp(HttpToolsProtocol):
         self._await(None)
 
     def send_400_response(self, msg: str) -> None:  # noqa: ARG002
-        """Answer what the parser or one of its callbacks refused, and close."""
+        """Answer a request that the parser or one of its callbacks refused, and close."""
         self._end(400, self._sentence or "the request is not valid HTTP/1.1")
 
     # Ours
@@ -175,7 +175,7 @@ class BoundedHttp(HttpToolsProtocol):
         self._check_timer = self.loop.call_later(CHECK_S, self._check)
         if self._phase_limit_s is None or self.loop.time() - self._since <= self._phase_limit_s:
             return
-        if not self._is_late:  # a process that was starved has yet to read what came in time
+        if not self._is_late:  # a starved process may still have to read data that came in time
             self._is_late = True
         elif self.cycle is not None and self._in_body and self.cycle.response_started:
             self.transport.abort()  # it was answered, and the rest of its body never came
@@ -188,7 +188,7 @@ class BoundedHttp(HttpToolsProtocol):
             self._check_timer = None
 
     def _check_upgrade(self, method: bytes) -> None:
-        """Refuse any Upgrade but a WebSocket's without a body, since uvicorn would drop the body."""
+        """Refuse any Upgrade except a WebSocket's without a body, since uvicorn would drop the body."""
         headers = dict(self.headers)
         is_websocket = headers.get(b"upgrade", b"").lower() == b"websocket" and method == b"GET"
         has_body = headers.get(b"content-length", b"0") != b"0" or b"transfer-encoding" in headers
@@ -202,7 +202,7 @@ class BoundedHttp(HttpToolsProtocol):
     def _end(self, status: int, sentence: str) -> None:
         """Answer with an error in place of the application, and close the connection."""
         if self.cycle is not None and not self.cycle.response_complete:
-            self.cycle.disconnected = True  # the application's reply, if it still makes one, goes nowhere
+            self.cycle.disconnected = True  # a later reply of the application is dropped
             self.cycle.message_event.set()
         self._limits.record(status, sentence, self.client and self.client[0])
         content = _encode(status, sentence)
@@ -214,20 +214,20 @@ class BoundedHttp(HttpToolsProtocol):
 
     def _refuse_connection(self, _scope: Scope, _receive: Receive, send: Send) -> Awaitable[None]:
         count = self._limits.per_address
-        sentence = f"your address has more than {count} connections, or all clients {MAX_CONNECTIONS}: close some"
+        sentence = f"your address has more than {count} connections, or all clients have {MAX_CONNECTIONS}: close some"
         self._limits.record(429, sentence, self.client and self.client[0])
         return _answer(send, 429, _encode(429, sentence))
 
 
 class BoundedWebSocket(WebSocketsSansIOProtocol):
-    """A WebSocket that ends when its client sends more than can be answered, and is not read while it reads nothing."""
+    """A WebSocket that closes if its client sends too much, and pauses reading while the client reads nothing."""
 
     _frames = 0
     _second = 0.0
     _is_refused = False
 
     def data_received(self, data: bytes) -> None:
-        """Read what came, as long as the client keeps to the bounds."""
+        """Read the data, as long as the client keeps to the bounds."""
         for start in range(0, len(data), SLICE_BYTES):
             if self._is_refused or self.transport.is_closing():
                 return
@@ -236,9 +236,9 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
                 self._end(f"more than {MAX_UNANSWERED} requests are unanswered")
 
     def handle_parser_exception(self) -> None:
-        """Send the close code, and drop what the client still sends.
+        """Send the close code, and drop further data from the client.
 
-        Closed at once with data unread, the connection would be reset, and the client would lose the close code.
+        If it were closed with unread data, the connection would be reset, and the client would lose the close code.
         """
         closed = self.conn.close_sent
         assert closed is not None
@@ -266,12 +266,12 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         self._count_frame()
 
     def pause_writing(self) -> None:
-        """Read nothing more while the client does not read."""
+        """Stop reading while the client does not read."""
         super().pause_writing()
         self.transport.pause_reading()
 
     def resume_writing(self) -> None:
-        """Read on, unless a message still waits for the application."""
+        """Continue reading, unless a message still waits for the application."""
         super().resume_writing()
         if not self.read_paused:
             self.transport.resume_reading()

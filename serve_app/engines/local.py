@@ -1,7 +1,7 @@
 """Embedded engine: the application on uvicorn, in this process or in workers under uvicorn's supervisor.
 
 One worker runs in the calling process. Several are processes of uvicorn's `Multiprocess`, which replaces a worker that
-died or hangs, and all of them, one by one, on SIGHUP. A worker whose parent has died ends itself.
+died or hangs, and on SIGHUP all of them, one by one. A worker exits when its parent has died.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ KEEP_ALIVE_S = 90  # [s] that a connection may be idle
 DRAIN_S = 15  # [s] for requests in progress when the server stops
 HUNG_S = 30  # [s] until an unresponsive worker is replaced; a start on a busy machine takes as long
 EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
-DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a full server needs
+DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a server at full load needs
 FEWEST_DESCRIPTORS = 64  # with fewer a server cannot start
 UVICORN = logging.getLogger("uvicorn.error")
 
@@ -81,22 +81,22 @@ def serve_policies(
     on_stop: Callable[[], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
-    """Serve the policies at or below `places`, folders or URIs, until Ctrl-C, SIGTERM or `stop`; return when all ended.
+    """Serve the policies at or below `places`, folders or URIs, until Ctrl-C, SIGTERM or `stop`.
 
     `served` is a `ServedConfig`: versions, aliases, canary, shadow. With an `admin_key_file`, and no admin key in the
-    settings, a key for administration is written there, readable by this user alone, and removed at the end. `on_ready`
-    is called when requests are answered, `on_stop` when the server begins to stop. A second Ctrl-C does not wait for
-    requests in progress.
+    settings, a key for administration is written there, readable only by this user, and removed at the end. `on_ready`
+    is called when the server answers requests, `on_stop` when it begins to stop. After a second Ctrl-C it does not wait
+    for requests in progress.
 
-    In the main thread this takes over SIGINT, SIGTERM and SIGHUP while it runs; in another thread, where there can only
-    be one worker, `stop` ends it. Raises UsageError or BundleError where something is wrong from the start, and
-    UnavailableError if a port or a storage cannot be had.
+    In the main thread this handles SIGINT, SIGTERM and SIGHUP while it runs; in another thread, which allows only one
+    worker, `stop` ends it. Raises UsageError or BundleError for a fault known at the start, and UnavailableError if a
+    port or a storage is not available.
     """
     if workers < 1:
         raise UsageError(f"workers must be 1 or more, got {workers}")
     in_main = threading.current_thread() is threading.main_thread()
     if workers > 1 and not in_main:
-        raise UsageError("several workers need the main thread, for their supervisor's signals")
+        raise UsageError("several workers must be started from the main thread, whose signals their supervisor handles")
     chosen = ServerSettings.from_environment(settings)
     ServedConfig.parse(dict(served or {}))
     keys = check_exposure(host, chosen)
@@ -133,7 +133,7 @@ def serve_policies(
 
 @dataclass
 class EmbeddedServer:
-    """Recipe of the application, which travels to the workers; uvicorn calls it in the process that serves."""
+    """Factory of the application, which is pickled for the workers; uvicorn calls it in the process that serves."""
 
     places: tuple[str, ...]
     host: str
@@ -142,7 +142,7 @@ class EmbeddedServer:
     settings: ServerSettings
     served: dict[str, Any]
     failure: RlservoError | None = None
-    """Why the start failed, in the process that serves."""
+    """Reason why the start failed, in the process that serves."""
     policies: tuple[tuple[str, str], ...] = ()
 
     def __call__(self) -> ASGIApp:
@@ -170,7 +170,7 @@ class EmbeddedServer:
             timeout_graceful_shutdown=DRAIN_S,
             timeout_worker_healthcheck=HUNG_S,
             ws_max_size=self.settings.max_body_bytes,
-            ws_per_message_deflate=False,  # costs more than it saves for messages of kilobytes
+            ws_per_message_deflate=False,  # for messages of kilobytes it costs more than it saves
             **options,
         )
 
@@ -190,7 +190,7 @@ class _Application:
         self._app: ASGIApp | None = None
 
     def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
-        """Answer one connection, or the server's own start and stop."""
+        """Handle one connection, or the server's own start and stop."""
         app = self._live if self._app is None or scope["type"] == "lifespan" else self._app
         return app(scope, receive, send)
 
@@ -220,7 +220,7 @@ class _Application:
         store = serving.handler.store()
         if settings.default_policy not in (None, *store.names):
             raise UsageError(
-                f"the default policy '{settings.default_policy}' is not among those to serve: {', '.join(store.names)}"
+                f"the default policy '{settings.default_policy}' is not served: expected {', '.join(store.names)}"
             )
         server.policies = tuple((name, store.default(name)) for name in store.names)
         if server.grpc_port is not None:
@@ -239,7 +239,7 @@ class _Application:
 
 
 def _stop_with_parent() -> None:
-    """Stop this worker when its supervisor has died, and remove what that would have removed."""
+    """Stop this worker if its supervisor has died, and remove the files that it would have removed."""
     loop, parent = asyncio.get_running_loop(), multiprocessing.parent_process()
     if parent is None:
         return
@@ -254,7 +254,7 @@ def _stop_with_parent() -> None:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server, which reports when it answers and when it begins to stop."""
+    """uvicorn's server, which reports when it is ready and when it begins to stop."""
 
     def __init__(
         self, config: uvicorn.Config, on_ready: Callable[[], None], on_stop: Callable[[], None] | None
@@ -269,7 +269,7 @@ class _Server(uvicorn.Server):
             self._on_ready()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Answer what is in progress, and stop."""
+        """Answer the requests in progress, and stop."""
         if self._on_stop is not None:
             self._on_stop()
         await super().shutdown(sockets)
@@ -289,7 +289,7 @@ def _run_here(
         running.should_exit = True
 
     configure(server.settings)
-    UVICORN.setLevel(logging.CRITICAL)  # what it would say of a failed start, our exception says
+    UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
     with _stop_signals(request_stop) if in_main else contextlib.nullcontext(), _stop_event(stop, request_stop):
         try:
             running.run(sockets=[listener])
@@ -303,11 +303,11 @@ def _run_workers(
     ready: Callable[[Sequence[tuple[str, str]]], None],
     on_stop: Callable[[], None] | None,
 ) -> None:
-    # What is wrong with the policies is reported here, once, before any worker starts.
+    # Faults of the policies are reported here, once, before any worker starts.
     with contextlib.closing(load_served(server.places, ServedConfig.parse(server.served), server.settings)) as store:
         policies = tuple((name, store.default(name)) for name in store.names)
     UVICORN.setLevel(logging.INFO)
-    with _stop_signals(lambda: None), shared_by_workers():  # the first puts back what the supervisor takes over
+    with _stop_signals(lambda: None), shared_by_workers():  # the first restores the supervisor's signal handlers
         supervisor = _Supervisor(server.config(), [listener], lambda: ready(policies), on_stop)
         supervisor.run()
     if not supervisor.is_asked_to_stop:
@@ -315,7 +315,7 @@ def _run_workers(
 
 
 class _Supervisor(Multiprocess):
-    """uvicorn's supervisor, which reports when all workers answer and ends those that do not exit."""
+    """uvicorn's supervisor, which reports when all workers are ready and kills those that do not exit."""
 
     def __init__(
         self,
@@ -351,7 +351,7 @@ class _Supervisor(Multiprocess):
         self.should_exit.set()
 
     def join_all(self) -> None:
-        """Wait for the workers to exit, and end those that do not."""
+        """Wait for the workers to exit, and kill those that do not."""
         for process in self.processes:
             process.process.join(EXIT_S)
             if process.process.exitcode is None:
@@ -363,7 +363,7 @@ class _Supervisor(Multiprocess):
 def _stop_signals(request_stop: Callable[[], None]) -> Iterator[None]:
     """Stop on SIGINT, SIGTERM and SIGHUP also before and after uvicorn handles them, and without an exception.
 
-    uvicorn raises a signal again when it has shut down. SIGHUP stays ignored where it is, as under nohup.
+    uvicorn raises a signal again after shutting down. SIGHUP stays ignored if it was, as under nohup.
     """
 
     def handle(_number: int, _frame: FrameType | None) -> None:
@@ -403,13 +403,13 @@ def _stop_event(stop: threading.Event | None, request_stop: Callable[[], None]) 
 
 
 def _raise_descriptor_limit() -> None:
-    """Allow as many open files as a full server needs, as far as the system does. Raises UsageError."""
+    """Raise the limit of open files to what a full server needs, as far as possible. Raises UsageError."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
     if hard != resource.RLIM_INFINITY and hard < FEWEST_DESCRIPTORS:
-        raise UsageError(f"this process may open {hard} files, and a server needs {FEWEST_DESCRIPTORS}: ulimit -n")
+        raise UsageError(f"this process may open {hard} files, a server needs {FEWEST_DESCRIPTORS}: raise 'ulimit -n'")
     if hard != resource.RLIM_INFINITY and hard < DESCRIPTORS:
         logger.warning(
             "this process may open %d files: about %d connections at once fit, further ones wait", hard, hard - 64

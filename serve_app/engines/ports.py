@@ -1,4 +1,4 @@
-"""Listening TCP sockets, and the sentence that says why one cannot be had."""
+"""Listening TCP sockets, and clear errors if a port is not available."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def listen(host: str, port: int, *, option: str = "--port") -> socket.socket:
     except OSError as error:
         raise UsageError(f"host '{host}' is not an address of this machine: {error.strerror}") from error
     listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # lingering closed connections do not matter
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # closed connections that linger do not matter
     try:
         _check_route(family, address)
         listener.bind(address)
@@ -33,30 +33,30 @@ def listen(host: str, port: int, *, option: str = "--port") -> socket.socket:
 
 
 def _check_route(family: int, address: Any) -> None:
-    """Raise OSError where this machine itself cannot reach an address of its own: its interface is down."""
+    """Raise OSError if this machine cannot reach its own address because its interface is down."""
     host, _, *rest = address
     if host in ("0.0.0.0", "::"):
         return
     with socket.socket(family, socket.SOCK_DGRAM) as probe:
-        probe.connect((host, 9, *rest))  # looks for a route, and sends nothing
+        probe.connect((host, 9, *rest))  # only looks up a route; sends nothing
 
 
 def _why_not(host: str, port: int, option: str, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         holder = port_holder(port)
         by = "" if holder is None else f" by '{holder[1]}' (process {holder[0]})"
-        return f"port {port} on {host} is in use{by}: stop it, or choose another with {option}"
+        return f"port {port} on {host} is in use{by}: stop that process, or choose another port with {option}"
     if error.errno == errno.ENETUNREACH:
         return f"{host} cannot be reached from this machine: is its interface up? (ip link set lo up)"
     if error.errno == errno.EACCES:
-        return f"port {port} needs more rights than this user has: choose one above 1023 with {option}"
+        return f"port {port} needs more rights than this user has: choose a port above 1023 with {option}"
     if error.errno == errno.EADDRNOTAVAIL:
         return f"host '{host}' is not an address of this machine: use 127.0.0.1, or 0.0.0.0 for all of its addresses"
     return f"cannot listen on {host}:{port}: {error.strerror}"
 
 
 def port_holder(port: int) -> tuple[int, str] | None:
-    """Return (pid, command name) of a process that listens on a TCP port, where the system shows it to this user."""
+    """Return (pid, command name) of a process that listens on a TCP port, if this user may see it."""
     for process in psutil.process_iter():  # psutil.net_connections names one process for each socket
         with contextlib.suppress(psutil.Error):
             listening = (each for each in process.net_connections("tcp") if each.status == psutil.CONN_LISTEN)

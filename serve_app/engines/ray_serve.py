@@ -1,11 +1,11 @@
 """Distributed engine: the application as one Ray Serve deployment, run by Ray's own commands.
 
 `serve run rlservo.serve_app.engines.ray_serve:build policies=DIR`, `serve deploy deploy/serve.yaml`. Ray starts,
-scales, replaces and upgrades the replicas. One deployment holds every policy: a policy is kilobytes and microseconds, a
-hop to another actor is milliseconds. A replica imports neither torch nor ray.rllib.
+scales, replaces and upgrades the replicas. One deployment holds every policy: a policy takes kilobytes and
+microseconds, a hop to another actor milliseconds. A replica imports neither torch nor ray.rllib.
 """
 
-# No `from __future__ import annotations` here: Serve reads the type of build's argument to know what to make of `args`.
+# No `from __future__ import annotations` here: Serve reads the type of build's argument to parse `args`.
 
 import asyncio
 import logging
@@ -57,7 +57,7 @@ class BuildArguments(BaseModel):
     """Versions, aliases, canary and shadow (ServedConfig), where `user_config` cannot be given; `user_config` wins."""
 
     settings: dict[str, Any] = {}
-    """Fields of ServerSettings; what is not given comes from RLSERVO_* variables, then from the defaults."""
+    """Fields of ServerSettings; missing ones come from RLSERVO_* variables, then from the defaults."""
 
     @field_validator("policies", mode="before")
     @classmethod
@@ -68,14 +68,14 @@ class BuildArguments(BaseModel):
 def build(args: BuildArguments) -> Application:
     """Return the application for `serve run` and `serve deploy`. Raises UsageError.
 
-    Relative folders are taken from the directory this runs in, since a replica's own is another.
+    Relative folders are resolved here, since a replica runs in another directory.
     """
     settings = ServerSettings.from_environment(args.settings)
     ServedConfig.parse(args.served)
-    # A folder may exist only on the nodes that run replicas, so it is the replica that looks.
+    # A folder may exist only on the nodes that run replicas, so the replica checks it.
     places = [place_of(place) for place in args.policies]
-    server: Deployment = cast("Deployment", PolicyServer)  # the decorator's type says it is still the class
-    # More than a replica takes on: what waits at Serve's limit waits behind clients that are slow to send a body.
+    server: Deployment = cast("Deployment", PolicyServer)  # the decorator is typed as if it returned the class
+    # Above a replica's own limit: requests held back by Serve would wait behind clients that send bodies slowly.
     limit = settings.max_ongoing_requests + settings.max_incoming + settings.max_streams + SPARE
     options = server.options(num_replicas=args.replicas, max_ongoing_requests=limit, user_config=args.served)
     return options.bind(places, settings.model_dump())
@@ -104,9 +104,9 @@ for _name in UNARY:
 
 @serve.deployment(
     name=DEPLOYMENT,
-    # A policy server spends its time waiting; a whole logical CPU would only keep replicas off small machines.
+    # A policy server mostly waits; reserving a whole logical CPU would only keep replicas off small machines.
     ray_actor_options={"num_cpus": 0.1},
-    # A line per request costs more than the policy; below this level Serve makes one all the same and drops it (5%).
+    # A line per request costs more than the policy; below this level Serve still formats it and drops it (5%).
     logging_config={"enable_access_log": False, "log_level": "WARNING"},
     health_check_period_s=1,  # a replica that hangs is replaced after three checks
     health_check_timeout_s=2,
@@ -145,9 +145,9 @@ class PolicyServer(InferenceMethods):
         return self._serving.app
 
     async def reconfigure(self, user_config: Any) -> None:
-        """Serve what the configuration says: Serve calls this at the start, and on `serve deploy` with another one.
+        """Apply the configuration: Serve calls this at the start, and on `serve deploy` with a new one.
 
-        Serve sends a replica nothing while this runs, so only the first call waits until all is loaded.
+        Serve sends a replica no requests while this runs, so only the first call waits until everything is loaded.
         """
         if self._is_started:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
@@ -159,17 +159,17 @@ class PolicyServer(InferenceMethods):
         self._is_started = True
 
     def record_autoscaling_stats(self) -> dict[str, float]:
-        """Tell Serve's autoscaler how busy this replica is, for `autoscaling.by_load`."""
+        """Report this replica's load to Serve's autoscaler, for `autoscaling.by_load`."""
         return {BUSY: self._load.measure()}
 
     async def check_health(self) -> None:
-        """Tell Serve's controller that the event loop runs and the policies are loaded; if not, it replaces us."""
+        """Report that the event loop runs and the policies are loaded; otherwise Serve replaces this replica."""
         await asyncio.sleep(0)
         if not self._is_started:
-            raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, and not null")
+            raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, not null")
 
     async def __del__(self) -> None:
-        """End the recording. Serve calls this when the replica has answered its last request."""
+        """End the recording. Serve calls this after the replica has answered its last request."""
         if (serving := getattr(self, "_serving", None)) is not None:
             await serving.stop()
 
@@ -181,11 +181,11 @@ class PolicyServer(InferenceMethods):
 
 
 def add_service(_servicer: Any, server: Any) -> None:
-    """Register the Open Inference Protocol at one of Serve's gRPC servers.
+    """Register the Open Inference Protocol with one of Serve's gRPC servers.
 
     `grpc_options.grpc_servicer_functions: [rlservo.serve_app.engines.ray_serve:add_service]` names it to Serve, which
-    puts its own functions in place of these, and passes a request on to the replica's method of the same name. Messages
-    stay bytes until they are there: garbage is then answered like every other error.
+    replaces these functions with its own, and passes a request on to the replica's method of the same name. Messages
+    stay bytes until then, so that garbage is answered like any other error.
     """
     methods: dict[str, Any] = {name: grpc.unary_unary_rpc_method_handler(_nothing) for name in UNARY}
     methods[STREAM] = grpc.stream_stream_rpc_method_handler(_nothing)
@@ -193,19 +193,19 @@ def add_service(_servicer: Any, server: Any) -> None:
 
 
 def _nothing(_request: Any, _context: Any) -> None:
-    """Serve puts its own function in this one's place."""
+    """Serve replaces this function with its own."""
 
 
 def _plain(error: RlservoError) -> RuntimeError:
-    """Return one sentence: Ray pickles what a constructor raises, and prints its text."""
+    """Return one sentence: Ray pickles a constructor's exception, and prints its text."""
     return RuntimeError(error.message)
 
 
 def _listening_host() -> str:
-    """Return the address that Serve's HTTP options name; every address if Serve does not report one.
+    """Return the address in Serve's HTTP options, or 0.0.0.0 if Serve does not report one.
 
-    Serve has no public question for it. Its controller has a well-known name and answers; a Serve whose controller is
-    another one is taken to listen everywhere, which asks for API keys.
+    Serve has no public function for it. Its controller has a well-known name and answers; a Serve with another
+    controller is assumed to listen everywhere, which requires API keys.
     """
     try:
         controller: Any = ray.get_actor(*CONTROLLER)

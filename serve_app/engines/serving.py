@@ -27,7 +27,7 @@ class Serving:
         is_alone: bool,
         is_behind_serve: bool = False,
     ) -> None:
-        """Take the folders and URIs of policies, this process's name and the address that is listened on.
+        """Take the folders and URIs of policies, this process's name and the address that it listens on.
 
         `is_alone` says whether every request reaches this process. Nothing is loaded yet. Raises UsageError.
         """
@@ -47,7 +47,7 @@ class Serving:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self, served: Any) -> None:
-        """Load and prove what the plan says, or if there is none `served` (ServedConfig).
+        """Load and prove the plan's versions or, without a plan, those of `served` (ServedConfig).
 
         Raises UsageError, BundleError and UnavailableError.
         """
@@ -58,7 +58,7 @@ class Serving:
             self._tasks.append(asyncio.create_task(keep_sampled(self.handler)))
         if self.settings.poll_s is not None:
             self._tasks.append(asyncio.create_task(self.control.poll_repository(self.settings.poll_s)))
-        # What is loaded by now stays: a collection that walks it would hold requests up.
+        # Objects loaded by now stay alive: a garbage collection that walks them would delay requests.
         gc.collect()
         gc.freeze()
 

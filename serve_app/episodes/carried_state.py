@@ -1,8 +1,8 @@
-"""Recurrent state carried by the client, tagged with its policy version so that no other accepts it.
+"""Recurrent state carried by the client, tagged with its policy version so that no other version accepts it.
 
-A reply's state names the graph that it belongs to, and, where the step from one action to the next is limited, holds
-the last action. Both stand under names that no recurrent state has, so a client that sends back what it got needs to
-know neither. On a server that records, the graph's name is followed by the episode's and the number of the next step.
+A reply's state names the graph that it belongs to and, if the step from one action to the next is limited, holds the
+last action. Both have names that no recurrent state has, so a client that sends the state back need not know them. On a
+server that records, the graph's name is followed by the episode's name and the number of the next step.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ LONGEST_EPISODE_ID = 256
 
 @dataclass(frozen=True, slots=True)
 class CarriedState:
-    """A state as a request brought it, taken apart."""
+    """The parts of a state in a request."""
 
     arrays: Mapping[str, Any]
     """By state name."""
 
     is_empty: bool = False
-    """An episode begins."""
+    """Whether an episode begins."""
 
     policy_identity: str | None = None
-    """The identity of the policy that gave it; None if the client has dropped it."""
+    """Identity of the policy that produced the state; None if the client has dropped it."""
 
     last_action: Any = None
 
@@ -39,7 +39,7 @@ class CarriedState:
 
     @classmethod
     def parse(cls, state: Mapping[str, Any]) -> CarriedState:
-        """Take a request's state apart. Raises RequestError."""
+        """Parse a request's state. Raises RequestError."""
         if not state:
             return NO_STATE
         arrays = {name: value for name, value in state.items() if not str(name).startswith(MARK)}
@@ -54,7 +54,7 @@ class CarriedState:
         if belongs_to is None:
             return cls(arrays, last_action=state.get(LAST_ACTION))
         if type(belongs_to) is not str:
-            raise RequestError(f"the state's '{BELONGS_TO}' must be the string that the last reply gave")
+            raise RequestError(f"the state's '{BELONGS_TO}' must be the string from the last reply")
         identity, mark = split_identity(belongs_to)
         return cls(arrays, policy_identity=identity, last_action=state.get(LAST_ACTION), mark=mark)
 
@@ -63,7 +63,7 @@ NO_STATE = CarriedState({}, is_empty=True)
 
 
 def split_identity(belongs_to: str) -> tuple[str, EpisodeStep | None]:
-    """Return the policy's identity and the episode's mark, of which a client may have made anything."""
+    """Return the policy's identity and the episode's mark, which a client may have altered."""
     identity, _, rest = belongs_to.partition(MARK_BEGINS)
     episode, _, step = rest.rpartition(MARK_BEGINS)
     if not episode or len(episode) > LONGEST_EPISODE_ID or not (step.isascii() and step.isdigit() and len(step) < 16):
@@ -72,7 +72,7 @@ def split_identity(belongs_to: str) -> tuple[str, EpisodeStep | None]:
 
 
 def carry(policy: Policy, step: Step, mark: EpisodeStep | None) -> dict[str, Any]:
-    """Return the state that a client is to send with its next request; `mark` is for a recording."""
+    """Return the state for the client's next request; `mark` is for a recording."""
     carried: dict[str, Any] = dict(step.own_state)
     carried[BELONGS_TO] = policy.identity
     if mark is not None:

@@ -1,9 +1,8 @@
 """Actions that depend on earlier ones: find a request's recurrent state, decide, keep the next state.
 
-It comes with the request and returns with the reply (`state`), or stays on the server: under a session's id, or with a
-stream. The request must say which: a recurrent policy that silently began an episode with every request would act
-wrongly and look right. A state goes to the version that it belongs to, and to no other. A refused request leaves it
-where it was.
+The state travels with request and reply (`state`), or stays on the server under a session's id or with a stream. The
+request must say which: a recurrent policy that silently began an episode with every request would act wrongly and look
+right. A state only reaches the version that it belongs to. A refused request does not change it.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from rlservo.serve_app.episodes.redis_sessions import RedisSessions
 
 NO_SHARED_SESSIONS = (
-    "this server has several processes and no store for sessions that they share: carry the 'state' in each request "
+    "this server has several processes and no shared session store: carry the 'state' in each request "
     "({} begins an episode), use a WebSocket, or start the server with one worker or with --session-store redis://..."
 )
 
@@ -44,27 +43,27 @@ class Episodes:
     def __init__(
         self, *, max_sessions: int, idle_s: float, store: RedisSessions | None = None, is_alone: bool = True
     ) -> None:
-        """`max_sessions` and `idle_s` bound what `MemorySessions` remembers.
+        """Take the bounds of `MemorySessions`: `max_sessions` and `idle_s`.
 
-        A `store` keeps the sessions instead. `is_alone` says whether this is the only process that requests reach.
+        A `store` keeps the sessions instead. `is_alone` says whether requests reach only this process.
         """
         self.sessions = MemorySessions(most=max_sessions, idle_s=idle_s)
         self._idle_s = idle_s
         self.store = store
         self._has_sessions = is_alone or store is not None
         self.marks_states = False
-        """Whether a state that goes to the client names its episode, for a recording."""
+        """Whether the state in a reply names its episode, for a recording."""
         self.begun: Counter[str] = Counter()
         """Sessions begun here, by policy name."""
         self.lost: Counter[str] = Counter()
-        """Requests whose session does not exist (any more), by policy name."""
+        """Requests for a session that does not exist or was lost, by policy name."""
 
     async def act(self, store: PolicyStore, request: Request) -> Decision:
-        """Decide for a request that says something of its episode, or came on a stream that keeps one.
+        """Decide for a request with episode fields, or on a stream that keeps an episode.
 
-        Only a session in a shared store is waited for. Raises SessionError, SessionLostError, RequestError,
-        UnavailableError if nothing more can be remembered or the store cannot be reached, and what `Policy.step`
-        raises; the recurrent state has then not moved on.
+        It waits only for a session in a shared store. Raises SessionError, SessionLostError, RequestError,
+        UnavailableError if there is no room or the store cannot be reached, and what `Policy.step` raises; the
+        recurrent state has then not changed.
         """
         episode, stream = request.episode or NO_EPISODE, request.stream
         if episode.final_status is not None and (episode.reset or (episode.state is not None and not episode.state)):
@@ -76,11 +75,11 @@ class Episodes:
             request.label = str(episode.session_id)
             if store.remembers(request.policy):
                 return await self._act_in_session(store, request, episode, episode.session_id)
-            # There is nothing to remember: the id says only which requests belong together.
+            # There is nothing to remember: the id only groups requests.
             episode = replace(episode, session_id=None, reset=False, end=False)
         if episode.end or (episode.reset and request.stream_id is None):
             word = "end" if episode.end else "reset"
-            raise RequestError(f"'{word}' is for a session: also send its 'session_id'")
+            raise RequestError(f"'{word}' needs a session: also send its 'session_id'")
         if episode.state is not None:
             return self._act_from_carried(store, request, episode)
         if stream is not None:
@@ -95,7 +94,7 @@ class Episodes:
     def policy_of(
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
     ) -> Policy:
-        """Return the policy whose tensors a request's are: its session's, or that of the state it carries."""
+        """Return the policy that a request's tensors belong to: its session's, or that of the state it carries."""
         session = None if session_id is None else self.sessions.find(name, session_id)
         if session is not None:
             return session.policy
@@ -103,7 +102,7 @@ class Episodes:
         return own or store.get(name, version)
 
     def _act_from_carried(self, store: PolicyStore, request: Request, episode: Episode) -> Decision:
-        """Act from a state that came with the request, for the version that it is of."""
+        """Act from a state in the request, with the version that it belongs to."""
         name, version, stream = request.policy, request.version, request.stream
         assert episode.state is not None
         carried = CarriedState.parse(episode.state)
@@ -115,10 +114,10 @@ class Episodes:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
-                    f"the state does not name its version of policy '{name}' it is, and that can be another than "
-                    f"{policy.contract.version} (loaded: {', '.join(store.versions(name))}): send back all that the "
-                    f"last reply gave ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
-                    "version in the address"
+                    f"the state does not name its version of policy '{name}', which may differ from "
+                    f"{policy.contract.version} (loaded: {', '.join(store.versions(name))}): send back the last "
+                    f"reply's whole state ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
+                    "version in the URL"
                 )
         needs_last = policy.has_step_limit and not carried.is_empty
         if needs_last and carried.last_action is None and episode.last_action is None:
@@ -134,7 +133,7 @@ class Episodes:
         """Return which step of which episode of the recording this is."""
         if carried.is_empty:
             return EpisodeStep(new_episode_id(request.label), 0)
-        return carried.mark or EpisodeStep(new_episode_id(request.label), 1)  # unknown which, but not the first
+        return carried.mark or EpisodeStep(new_episode_id(request.label), 1)  # unknown, but not the first
 
     def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
@@ -156,10 +155,10 @@ class Episodes:
     async def _act_in_session(
         self, store: PolicyStore, request: Request, episode: Episode, session_id: SessionId
     ) -> Decision:
-        """Act from the state that stands under the request's id."""
+        """Act from the state stored under the request's id."""
         name = request.policy
         if episode.state is not None:
-            raise RequestError("the request has a 'state' and a 'session_id': either you carry the state, or we do")
+            raise RequestError("the request has both 'state' and 'session_id': send one of them")
         if not self._has_sessions:
             raise RequestError(NO_SHARED_SESSIONS)
         try:
@@ -171,9 +170,9 @@ class Episodes:
         return decision
 
     def _step_session(self, store: PolicyStore, request: Request, session: Session | None) -> tuple[Decision, Session]:
-        """Return the decision and the session after it; the one before stays as it is.
+        """Return the decision and the session after it; the given session is not changed.
 
-        A session answered its last request already when that is repeated; then it is also the one after.
+        If the last request is repeated, the session has already answered it, and is returned unchanged.
         """
         episode, seq = request.episode, request.seq
         assert episode is not None and episode.session_id is not None
@@ -202,7 +201,7 @@ class Episodes:
         shown = shorten(session_id)
         return SessionLostError(
             f"this server has no session '{shown}' of policy '{request.policy[:64]}': it was never begun, was ended, "
-            f"was idle for {self._idle_s:g} s, or ended with its process, store or version: begin an episode",
+            f"was idle for {self._idle_s:g} s, or was lost with its process, store or version: begin an episode",
             {"session_id": shown, "policy": request.policy[:64]},
         )
 
@@ -211,17 +210,17 @@ NO_EPISODE = Episode()
 
 
 def _choose(store: PolicyStore, request: Request) -> Policy:
-    """Return the policy for a request that is with none yet."""
+    """Return the policy for a request without one."""
     return store.choose(request.policy, request.version, request.label)
 
 
 def _owner(store: PolicyStore, request: Request, identity: str) -> Policy:
-    """Return the policy that a carried state is of. Raises SessionError, or SessionLostError if it is gone."""
+    """Return the policy of a carried state. Raises SessionError, or SessionLostError if it is gone."""
     own = store.find(request.policy, identity)
     if own is None:
-        store.get(request.policy, request.version)  # a policy or version that does not exist comes first
+        store.get(request.policy, request.version)  # an unknown policy or version is reported first
         raise SessionLostError(
-            f"the state is of '{identity[:128]}', which is not loaded here (any more) as policy '{request.policy}': "
+            f"the state belongs to '{identity[:128]}', which is not or no longer loaded as policy '{request.policy}': "
             "begin an episode (state {})",
             {"state": identity[:128]},
         )
@@ -233,11 +232,11 @@ def _check_version(store: PolicyStore, request: Request, policy: Policy, memory:
     """Raise SessionLostError if the policy of a memory is gone, SessionError if the request names another."""
     own = f"version {policy.contract.version} of policy '{request.policy}'"
     if not store.has(policy):
-        raise SessionLostError(f"{memory} is of {own}, which is no longer loaded: begin an episode")
+        raise SessionLostError(f"{memory} belongs to {own}, which is no longer loaded: begin an episode")
     if request.version is not None and store.get(request.policy, request.version) is not policy:
         raise SessionError(
-            f"{memory} is of {own}, and the request names version {request.version[:32]}: begin an episode with that "
-            "one, or name the memory's"
+            f"{memory} belongs to {own}, but the request names version {request.version[:32]}: begin an episode with "
+            "it, or name the version of the state"
         )
 
 
@@ -249,7 +248,7 @@ def _take_step(
     *,
     session: Session | None = None,
 ) -> tuple[Decision, Step]:
-    """Take a step from what the client carries, or from a session's state."""
+    """Take a step from the client's state, or from a session's."""
     return take_step(
         policy,
         request.obs,

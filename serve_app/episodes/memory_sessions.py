@@ -1,8 +1,7 @@
 """Sessions in this process, bounded in number, evicted when idle.
 
-A session is begun explicitly. A request for one that does not exist gets an error, because a state begun again in the
-middle of an episode would give wrong actions without notice. `redis_sessions.py` keeps them where several processes
-find them.
+A session is begun explicitly. A request for an unknown session gets an error, because a state restarted in the middle
+of an episode would give wrong actions silently. `redis_sessions.py` keeps sessions that several processes share.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ class MemorySessions:
     """The sessions of one process, by policy name and session id."""
 
     def __init__(self, *, most: int, idle_s: float) -> None:
-        """`most` bounds the episodes in memory, in sessions and on streams together (a batch is so many)."""
+        """`most` bounds the episodes in memory, in sessions and on streams together (each row of a batch is one)."""
         self._most = most
         self._idle_s = idle_s
-        self._sessions: OrderedDict[Key, Session] = OrderedDict()  # the longest unused come first
+        self._sessions: OrderedDict[Key, Session] = OrderedDict()  # the least recently used come first
         self.rows = 0  # episodes remembered, in sessions and on streams
         self.evicted: Counter[str] = Counter()  # by policy name
 
@@ -38,12 +37,12 @@ class MemorySessions:
         return len(self._sessions)
 
     def count(self) -> Counter[str]:
-        """Return how many sessions there are, by policy name."""
+        """Return the number of sessions, by policy name."""
         self._evict()
         return Counter(name for name, _ in self._sessions)
 
     def find(self, name: str, session_id: SessionId) -> Session | None:
-        """Return a session that is not idle, None if there is none."""
+        """Return a session that is not idle, or None."""
         self._evict()
         return self._sessions.get((name, session_id))
 
@@ -52,7 +51,7 @@ class MemorySessions:
     ) -> Decision:
         """Decide for a request of a session. Raises UnavailableError, ClientGoneError, and what `step_session` raises.
 
-        It waits for nothing where requests come in order anyway: on the connection of the last one.
+        It does not wait on the last request's connection, where requests come in order anyway.
         """
         key = (request.policy, session_id)
         before = self.find(*key)
@@ -80,24 +79,24 @@ class MemorySessions:
             self.rows -= session.rows
 
     def reserve(self, stream: Session, rows: int) -> None:
-        """Reserve the places of a stream's episodes. Raises UnavailableError, and nothing has changed."""
+        """Reserve places for a stream's episodes. Raises UnavailableError, and then changes nothing."""
         self._evict()
         self._check_room(rows - stream.rows)
         self.rows += rows - stream.rows
         stream.rows = rows
 
     def release(self, stream: Session) -> None:
-        """Give the places of a stream's episodes back."""
+        """Release the places of a stream's episodes."""
         self.rows -= stream.rows
         stream.rows = 0
 
     def _check_room(self, more: int) -> None:
         if more > 0 and self.rows + more > self._most:
-            what = "another episode" if more == 1 else f"{more} more episodes (a batch is so many)"
+            what = "another episode" if more == 1 else f"{more} more episodes (one per row of the batch)"
             raise UnavailableError(
-                f"the server remembers {self.rows} episodes already, at most {self._most}, and has no room for {what}: "
-                f"end a session, wait until an idle one is evicted ({self._idle_s:g} s), or send the state along with "
-                "each request",
+                f"the server remembers {self.rows} of at most {self._most} episodes and has no room for {what}: end a "
+                f"session, wait until an idle one is evicted ({self._idle_s:g} s), or send the state along with each "
+                "request",
                 {"episodes": self.rows, "most": self._most},
             )
 
@@ -112,13 +111,13 @@ class MemorySessions:
 
 
 def overtaken(request: Request, session_id: SessionId) -> RlservoError:
-    """Return the error of a request during which another one began its session."""
+    """Return the error for a request whose session was begun again meanwhile."""
     shown = f"session '{shorten(session_id)}' of policy '{request.policy[:64]}'"
     if request.episode is not None and request.episode.reset:
-        return UnavailableError(f"another request began {shown} at the same time: try again")
-    return SessionError(f"the request was under way when another one began {shown} again: it is of the episode before")
+        return UnavailableError(f"another request started {shown} at the same time: try again")
+    return SessionError(f"the request belongs to an earlier episode: another one has restarted {shown} since")
 
 
 def shorten(session_id: SessionId) -> str:
-    """Return an id as an error's sentence may show it."""
+    """Return an id in a form for error messages."""
     return str(session_id)[:64]

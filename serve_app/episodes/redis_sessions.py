@@ -1,12 +1,12 @@
-"""Sessions in Redis, shared by several processes: a memory is replaced only by the step that was computed from it.
+"""Sessions in Redis, shared by several processes: a memory is only replaced by the step computed from it.
 
-A key holds a stamp, new with every write, and the session. A step reads both, computes, and writes if the stamp is
-still the one that it read; otherwise another step was written first, and it starts again with what that one left. So
-the memories of a session form one chain, and an answer is sent only after its memory is part of it: however late a
-process continues or a write arrives, no step is computed from an old memory.
+A key holds a stamp, new with every write, and the session. A step reads both, computes, and writes if the stamp has not
+changed; otherwise another step was written first, and it starts again from that one. So the memories of a session form
+one chain, and an answer is sent only after its memory is part of it: even if a process or a write is delayed, no step
+is computed from an old memory.
 
-A Redis that restarts or fails over may come back with an older copy. A session names the run of Redis (`run_id`) in
-which it was written, and is lost in every other.
+After a restart or failover Redis may have an older copy. A session names the run of Redis (`run_id`) in which it was
+written, and is lost in every other.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ CONNECTIONS = 64  # of one process at most; each carries one command at a time
 TIMEOUT_S = 1.0  # for a connection, and for each reply
 STAMP_BYTES = 16
 READ = "return {redis.call('GET', KEYS[1]), string.match(redis.call('INFO', 'server'), 'run_id:(%x+)')}"
-# A command whose reply was lost is sent again: a write that is there already has succeeded.
+# A command whose reply was lost is sent again: if its write is already stored, it has succeeded.
 WRITE = f"""
 local now = redis.call('GETRANGE', KEYS[1], 0, {STAMP_BYTES - 1})
 if now == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2], 'PX', ARGV[3]) end
@@ -46,7 +46,7 @@ return now == ARGV[1] or now == string.sub(ARGV[2], 1, {STAMP_BYTES})
 """
 
 FIELDS = ("state", "last", "steps", "begun", "seq", "inputs_hash", "is_ended")
-ANSWER_FIELDS = ("infer_ms", "batch", "notices")  # of a `Decision`: its action is the session's last
+ANSWER_FIELDS = ("infer_ms", "batch", "notices")  # in a `Decision`: its action is the session's last
 
 
 class RedisSessions:
@@ -63,8 +63,8 @@ class RedisSessions:
         retry = Retry(NoBackoff(), 1, supported_errors=(RedisConnectionError,))  # an idle connection may be closed
         try:
             self._redis = Redis.from_url(url, socket_timeout=TIMEOUT_S, socket_connect_timeout=TIMEOUT_S, retry=retry)
-        except ValueError:  # whose sentence may hold the password
-            raise UsageError("the session store's URL is not usable: expected redis://HOST:PORT/DATABASE") from None
+        except ValueError:  # its message may hold the password
+            raise UsageError("the session store's URL is not valid: expected redis://HOST:PORT/DATABASE") from None
         self._read = self._redis.register_script(READ)
         self._write = self._redis.register_script(WRITE)
         self._connections = asyncio.Semaphore(CONNECTIONS)
@@ -94,7 +94,7 @@ class RedisSessions:
     ) -> tuple[bytes, bytes, Session | None]:
         """Return (stamp, Redis's run, session). Also raises ClientGoneError."""
         record, run = await self._call(request, self._read, key)
-        await check_client(request)  # after the read: what its client sent later is not in it, or it has hung up by now
+        await check_client(request)  # after the read: it lacks later requests, or the client has hung up
         if record is None:
             return b"", run, None
         return record[:STAMP_BYTES], run, _unpack(record[STAMP_BYTES:], store, request.policy, session_id, run)
@@ -108,7 +108,7 @@ class RedisSessions:
             async with self._connections:
                 check_deadline(request)
                 if time.perf_counter() - request.received > self._patience_s:
-                    raise OverloadedError(f"the session's turn did not come within {self._patience_s:g} s: try again")
+                    raise OverloadedError(f"other requests kept the session busy for {self._patience_s:g} s: try again")
                 reply = await script(keys=[key], args=arguments)
         except (RedisError, OSError) as error:
             self.unreachable += 1
@@ -116,7 +116,7 @@ class RedisSessions:
                 self._is_down = True
                 logger.warning("Redis, which keeps the sessions, cannot be used: %s", error)
             raise UnavailableError(
-                "the store of this server's sessions cannot be used at the moment: try again, or carry the 'state' in "
+                "this server's session store is unavailable at the moment: try again, or carry the 'state' in "
                 "each request"
             ) from None
         if self._is_down:

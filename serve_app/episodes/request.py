@@ -1,4 +1,4 @@
-"""Request for an action, which every protocol fills, with its episode; and the fields of its reply."""
+"""Request for an action in the form that all protocols share, its episode, and the fields of its reply."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.versions.policy_store import Decision
 
 SessionId: TypeAlias = str | int
-"""Triton's clients number their sequences; 7 and "7" are two."""
+"""Triton's clients number their sequences; 7 and "7" are different."""
 
 MAX_SEED = 2**63 - 1
 LONGEST_SESSION_ID = 128
@@ -22,12 +22,12 @@ LONGEST_LABEL = LONGEST_SESSION_ID  # a header may have 16 KB
 
 
 def new_episode_id(label: str | None) -> str:
-    """Return an id for an episode, or a stream, of a client with this label."""
+    """Return an id for an episode or a stream of a client with this label."""
     return secrets.token_hex(8) if label is None else f"{shorten_label(label)}.{secrets.token_hex(4)}"
 
 
 def shorten_label(label: str) -> str:
-    """Return a label as an episode's id has it: of a long one the beginning and a hash."""
+    """Return a label for an episode's id: a long one is cut and gets a hash."""
     if len(label) <= LONGEST_LABEL:
         return label
     digest = hashlib.blake2b(label.encode("utf-8", "surrogatepass"), digest_size=8).hexdigest()
@@ -36,21 +36,21 @@ def shorten_label(label: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """Fields of a request about its episode. A client may send each of these fields, and no other."""
+    """Fields of a request about its episode. A client may send only these."""
 
     state: Mapping[str, Any] | None = None
-    """The recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: it
-    carries none."""
+    """The recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: not
+    carried."""
 
     session_id: SessionId | None = None
     reset: bool = False  # begin the session, or the stream's episode
     end: bool = False  # forget the session after this request
     reward: Any = None
     final_status: str | None = None
-    """End of the episode, in the client's word: the observation is the one after its last action."""
+    """End of the episode, in the client's words: the observation is the one after its last action."""
 
-    truncated: bool = False  # whether it was broken off, as by a limit on its time
-    last_action: Any = None  # what the robot was last commanded, where a limit is set on the step from it
+    truncated: bool = False  # whether it was cut off, as by a time limit
+    last_action: Any = None  # the robot's last command, if the step from it is limited
 
 
 OPTIONS = ("explore", "seed", "seq", "deadline_ms", "timestamp")
@@ -67,30 +67,30 @@ class Request:
     """
 
     protocol: str
-    """As metrics and log name it."""
+    """Name in metrics and log."""
     policy: str
     version: str | None
     """A version or an alias; None is the default version."""
     received: float
-    """When its first byte was here, by `time.perf_counter`."""
+    """Time of arrival of its first byte, by `time.perf_counter`."""
 
     arrived: float = field(default_factory=time.perf_counter)
-    """When this process saw it, which `received` may be set back from."""
+    """Time at which this process saw it; `received` may be earlier."""
     connection: Any = None
-    """The address of the client's own connection, on which requests come in order; None if that is not known."""
+    """Address of the client's own connection, on which requests come in order; None if unknown."""
     has_hung_up: Callable[[], Awaitable[bool]] | None = None
-    """Whether its client has gone, as far as is known; None if it cannot be known."""
+    """Tells whether its client has disconnected; None if that cannot be known."""
     label: str | None = None
-    """Whose request it is, in the client's words: when a canary runs, all of a label get the same version."""
+    """Name that the client gave itself: during a canary, all requests with one label get the same version."""
     request_id: str | None = None
     headers: Mapping[bytes, bytes] = field(default_factory=dict)
-    """Of an HTTP message, or the metadata of a gRPC call."""
+    """Headers of an HTTP message, or metadata of a gRPC call."""
     is_fresh: bool = False
-    """Whether it came after the stream's last reply, and so did not wait while the server was blocked."""
+    """Whether it came after the stream's last reply, so it did not wait while the server was blocked."""
     stream: Session | None = None
-    """The episode of the stream that it came on."""
+    """The episode of its stream."""
     stream_id: str | None = None
-    """Of its WebSocket, whose requests share a request id and are distinguished by `seq`."""
+    """Id of its WebSocket, whose requests share it and are distinguished by `seq`."""
 
     may_explore: bool = False
     """Whether its key may ask for exploring actions."""
@@ -99,9 +99,9 @@ class Request:
     explore: bool = False
     seed: int | None = None
     seq: int | None = None
-    """The client's number, echoed in the reply."""
+    """The client's request number, echoed in the reply."""
     deadline_ms: float | None = None
-    """[ms] After `received`; what cannot be answered by then is not computed."""
+    """[ms] After `received`; a request that is late by then is not computed."""
     timestamp: float | None = None
     """[s] The client's clock, echoed in the reply."""
     episode: Episode | None = None
@@ -112,11 +112,11 @@ class Request:
 
 
 class ClientGoneError(Exception):
-    """The client hung up: no one waits for an answer, and there is nothing to count."""
+    """The client hung up: there is nothing to answer or count."""
 
 
 async def check_client(request: Request) -> None:
-    """Raise ClientGoneError if a session's client gave its request up: its next episode may have begun."""
+    """Raise ClientGoneError if a session's client has given up its request: its next episode may have begun."""
     if request.has_hung_up is not None and await request.has_hung_up():
         raise ClientGoneError
 
@@ -126,7 +126,7 @@ def check_deadline(request: Request) -> None:
     late_ms = (time.perf_counter() - request.received) * 1e3
     if request.deadline_ms is not None and late_ms >= request.deadline_ms:
         raise DeadlineError(
-            f"the deadline of {request.deadline_ms:g} ms passed before the policy was asked: nothing computed",
+            f"the deadline of {request.deadline_ms:g} ms passed before inference: no action was computed",
             {"deadline_ms": request.deadline_ms, "elapsed_ms": round(late_ms, 3), "seq": request.seq},
         )
 

@@ -1,4 +1,4 @@
-"""Session: the recurrent state of a running episode on the server, and its last answer."""
+"""Session: recurrent state of a running episode on the server, and its last answer."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from rlservo.serve_app.versions.policy_store import Decision
 
 @dataclass(slots=True)
 class Session:
-    """One episode, or so many side by side, of one policy in one version."""
+    """One episode, or a batch of them, of one version of a policy."""
 
     policy: Policy
     state: State | None = None  # None: at its start
     last: dict[str, NDArray[np.generic]] | None = None  # the last action's leaves
     steps: int = 0
-    rows: int = 0  # episodes that it takes the place of
+    rows: int = 0  # number of episodes that it counts as
     used: float = field(default_factory=time.monotonic)
-    begun: float = field(default_factory=time.perf_counter)  # the episode: no two of an id have the same
+    begun: float = field(default_factory=time.perf_counter)  # number of the episode, unique for its id
     connection: Any = None  # of the last request
     seq: int | None = None  # of the last request that was answered
     inputs_hash: bytes = b""  # of its observation
-    answer: Decision | None = None  # to the last request, for the same request sent again; None if it had no `seq`
+    answer: Decision | None = None  # to the last request, in case it is sent again; None if it had no `seq`
     is_ended: bool = False  # kept only for its answer
 
     def keep(self, step: Step) -> None:
-        """Remember a step's outcome."""
+        """Store a step's outcome."""
         self.state = step.state or None
         self.last = step.leaves
         self.steps += 1
@@ -45,10 +45,10 @@ class Session:
         self.steps = 0
 
     def answer_again(self, seq: int | None, obs: Any) -> Decision | None:
-        """Return the last request's answer if this is the same request again (its reply got lost).
+        """Return the last request's answer if this is the same request again (because its reply was lost).
 
-        To compute it twice would move the recurrent state on twice. Raises SessionError for a request that comes out of
-        order, and for another one under the last one's number: the old answer would be an action for what is long past.
+        Computing it twice would advance the recurrent state twice. Raises SessionError for a request out of order, and
+        for a different one with the last one's number: the old answer would be an action for a past observation.
         """
         if seq is None or self.seq is None or seq > self.seq:
             return None
@@ -56,11 +56,11 @@ class Session:
             if self.policy.fingerprint(self.policy.parse(obs).arrays) == self.inputs_hash:
                 return self.answer
             raise SessionError(
-                f"request {seq} of its session was answered already, for another observation: give every request a "
+                f"request {seq} of this session was already answered, for another observation: give every request a "
                 "larger 'seq' than the one before, or none",
                 {"seq": seq, "last_seq": self.seq},
             )
         raise SessionError(
-            f"request {seq} came after request {self.seq} of its session was answered: send them in order",
+            f"request {seq} came after request {self.seq} of this session was answered: send requests in order",
             {"seq": seq, "last_seq": self.seq},
         )

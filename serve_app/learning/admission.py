@@ -1,7 +1,7 @@
-"""Admission of recorded episodes to learning: of a known version, whole, explored, and within the contract.
+"""Admission of recorded episodes to learning: whole, explored, of a known version and within its contract.
 
-Others are dropped with a reason, and counted by it. Nothing a client sends can pass for an action of the
-policy's: the server records what it drew, and the graph and contract it drew from must be those that this run made.
+Others are dropped and counted by reason. A client cannot pass off its own action as the policy's: the server records
+its draws, and the graph and contract they came from must be this run's.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from rlservo.serve_app.recording.episodes import Columns, Episode
 from rlservo.serve_app.recording.own_actions import is_sent_as
 
 LOGP_TOLERANCE = 1e-4
-"""Tolerance of a recorded log-probability against its own distribution's: both come from the same recorded float32."""
+"""Tolerance of a recorded log-probability against its own distribution's: both come from the same float32."""
 
 Reward: TypeAlias = Callable[[Any, Any, Any], "float | tuple[float, bool]"]
-"""The reward of an action: `reward(obs, action, next_obs)`, each in its space's own form; with it, if the function
-knows, whether the episode has ended there."""
+"""Reward of an action: `reward(obs, action, next_obs)`, each in its space's own form; optionally with whether the
+episode ends there."""
 
 
 @dataclass(frozen=True)
 class KnownVersion:
-    """A version that this run has made, as a server's recording identifies it."""
+    """A version made by this run, with its identity in a server's recordings."""
 
     version: str
     graph_sha256: str
@@ -45,21 +45,21 @@ class Admitted:
     episode: Episode
     version: KnownVersion
     age: int
-    """Number of versions since the one that acted."""
+    """Number of versions released since the one that acted."""
     rewards: NDArray[np.float64]
 
 
 class Admission:
-    """Decides about one episode after the other."""
+    """Judges episodes one by one."""
 
     def __init__(self, policy: str, *, max_age: int, reward: Reward | None = None) -> None:
-        """`reward` replaces the rewards that clients report."""
+        """Take the settings; `reward` replaces the rewards that clients report."""
         self._policy, self.max_age, self._reward = policy, max_age, reward
 
     def parts(self, episode: Episode) -> list[Episode]:
         """Split a recorded episode where the reward function ends one.
 
-        Without an end, the last decision is only the observation after the one before.
+        Without an end, the last decision only serves as the observation after the previous one.
         """
         ours = episode.policy.contract.name == self._policy
         if self._reward is None or not ours or episode.goes_on or _why_not_drawn(episode) is not None:
@@ -77,23 +77,23 @@ class Admission:
     def judge(
         self, episode: Episode, versions: Sequence[KnownVersion], *, any_age: bool = False
     ) -> Admitted | str | None:
-        """Return the episode, or the reason against it; None if it is another policy's. `versions`: newest last."""
+        """Return the episode, or the reason to drop it; None if it is another policy's. `versions`: newest last."""
         contract = episode.policy.contract
         if contract.name != self._policy:
             return None
         place = next((i for i, known in enumerate(versions) if known.version == contract.version), None)
         if place is None:
-            return "of a version that this run has not made"
+            return "of a version that this run did not make"
         known, age = versions[place], len(versions) - 1 - place
         if (episode.policy.graph_hash, episode.policy.contract_hash) != (known.graph_sha256, known.contract_sha256):
-            return "of another graph or contract than the version's"
+            return "whose graph or contract is not the version's"
         if age > self.max_age and not any_age:
             return "of a version that is too old"
         if (reason := why_not_whole(episode) or _why_not_drawn(episode)) is not None:
             return reason
         rewards = episode.reward
         if self._reward is not None:
-            rewards = np.full(len(episode), np.nan)  # the last one's needs the observation after it
+            rewards = np.full(len(episode), np.nan)  # the last reward needs the observation after it
             computed = [reward for reward, _ in _computed(episode, self._reward)]
             rewards[: len(computed)] = computed
         reason = why_without_reward(episode, rewards)
@@ -103,7 +103,7 @@ class Admission:
 def _why_not_drawn(episode: Episode) -> str | None:
     """Return the reason why an episode's actions are not the policy's own draws from its observations."""
     if not episode.may_teach:
-        return "of which a key without the role explore reported something"
+        return "with reports from a key without the role explore"
     if not episode.explored.all():
         return "in which not every action explored"
     if not episode.acted.all() or episode.fell_back.any():
@@ -115,13 +115,13 @@ def _why_not_drawn(episode: Episode) -> str | None:
         return "without every log-probability"
     logp = episode.policy.log_probability(episode.dist_inputs, episode.own_action)
     if logp is None or not (np.abs(logp - episode.logp) <= LOGP_TOLERANCE * np.maximum(1.0, np.abs(logp))).all():
-        return "whose log-probabilities are not those of their distributions"
+        return "whose log-probabilities do not match their distributions"
     return _why_not_sent(episode)
 
 
 def _why_not_sent(episode: Episode) -> str | None:
-    """Return the fault of the sent actions. A limit on the step may have changed them: it is the
-    environment's part, as clipping is, and the own action is learned.
+    """Return the fault of the sent actions. A step limit may have changed them: it counts as part of the environment,
+    like clipping, and the own action is learned.
     """
     contract = episode.policy.contract
     transform, is_limited = transform_of(contract), "max_action_step" in episode.policy.options
@@ -131,12 +131,12 @@ def _why_not_sent(episode: Episode) -> str | None:
         if not ((sent >= low.astype(sent.dtype)) & (sent <= high.astype(sent.dtype))).all():
             return "with an action outside the contract's bounds"
         if not is_limited and not is_sent_as(to_sent(episode.own_action[name], transform, leaf), sent, leaf).all():
-            return "whose actions are not what the policy drew"
+            return "whose actions are not the policy's draws"
     return None
 
 
 def _computed(episode: Episode, reward: Reward) -> list[tuple[float, bool]]:
-    """Return each action's reward and whether it ended the episode; the last one needs the observation after it."""
+    """Return each action's reward and whether it ended the episode; the last needs the observation after it."""
     contract = episode.policy.contract
     final: Columns | None = episode.final_obs
     seen = [row_of(contract.observation_space, episode.obs, row, "obs") for row in range(len(episode))]
@@ -154,7 +154,7 @@ def _computed(episode: Episode, reward: Reward) -> list[tuple[float, bool]]:
 
 
 def reward_of(source: str, name: str) -> Reward:
-    """Return the function `reward` of a Python file's text. Raises UsageError if there is none."""
+    """Return the function `reward` of a Python file's text. Raises UsageError if it has none."""
     namespace: dict[str, Any] = {"__name__": "rlservo_reward"}
     try:
         exec(compile(source, name, "exec"), namespace)
@@ -164,7 +164,7 @@ def reward_of(source: str, name: str) -> Reward:
 
 
 def named_reward(name: str) -> Reward:
-    """Return the function that a contract names, `module:function`. Raises UsageError where there is none."""
+    """Return the function that a contract names, `module:function`. Raises UsageError if it does not exist."""
     module, _, function = name.partition(":")
     try:
         found = getattr(importlib.import_module(module), function, None)

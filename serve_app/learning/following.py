@@ -1,8 +1,8 @@
-"""Recordings followed while servers write them: each episode once, as soon as it has ended.
+"""Recordings followed while servers write them: each episode is read once, as soon as it has ended.
 
-Every poll reads what was added to the files since the last one, to the last whole chunk. A file that cannot be read is
-left out with one sentence, and the others continue. A remote server's files are copied first, by what was added. No two
-files' clocks are compared: those of servers may differ.
+Every poll reads the files' additions since the last one, to the last whole chunk. A file that cannot be read is skipped
+with one message, and the others continue. A remote server's files are copied first, additions only. Clocks of different
+files are never compared, as servers' clocks may differ.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from rlservo.serve_app.recording.reader import FileFacts, FileReader, Recording,
 from rlservo.serve_app.recording.recorder import FILE_NAME, SUFFIX
 
 SILENT_NS = 60_000_000_000
-"""An episode without an end is over after this, by its file's clock: no more than a minute passes between decisions."""
+"""Longest pause between decisions, by the file's clock, after which an episode without an end is over."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """An episode that has ended, or a piece without continuation, and its key in the learner's state."""
+    """An episode that has ended, or a piece without continuation, with its key in the learner's state."""
 
     file: str
     """The file that holds its end."""
     key: str
-    """Its id and the time of its first decision: robots may use an id again."""
+    """Its id and the time of its first decision: robots may reuse an id."""
     episode: Episode
 
 
 class ServerRecordings:
-    """A copy of the recordings of a server elsewhere: what it deletes is deleted here as well."""
+    """A copy of a remote server's recordings; files deleted there are deleted here as well."""
 
     def __init__(self, connect: Callable[[], AdminClient], folder: Path) -> None:
-        """`connect` makes a client with the admin key as it is then; the copy is in `folder`."""
+        """Take `connect`, which makes a client with the current admin key, and the copy's `folder`."""
         self._connect, self.folder = connect, folder.absolute()
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def update(self) -> None:
-        """Fetch what the server has recorded since the last time. Raises RlservoError."""
+        """Fetch the server's new records since the last call. Raises RlservoError."""
         with self._connect() as client:
             there = client.recordings()
             for name, size in there.items():
@@ -65,7 +65,7 @@ class FollowedRecordings:
         servers: Sequence[ServerRecordings] = (),
         progress: Callable[[str], object] = str,
     ) -> None:
-        """`notify` gets one sentence for each file that cannot be read, `progress` which server is waited for.
+        """`notify` gets one sentence for each unreadable file, `progress` the server that is waited for.
 
         Raises UsageError if a folder does not exist.
         """
@@ -80,11 +80,11 @@ class FollowedRecordings:
         self._writers: dict[str, EpisodeAssembler] = {}
 
     def names(self) -> set[str]:
-        """Return the names of the present files."""
+        """Return the names of the existing files."""
         return {str(path) for path in self._paths()}
 
     def poll(self) -> Iterator[Ended]:
-        """Yield the episodes that have ended since the last poll. Raises RlservoError where a server refuses."""
+        """Yield the episodes that have ended since the last poll. Raises RlservoError if a server refuses."""
         for server in self._servers:
             try:
                 server.update()
@@ -111,7 +111,7 @@ class FollowedRecordings:
             except OSError as error:
                 facts.damage = error.strerror or str(error)
             if facts.damage is not None:
-                self._notify(f"{path} is read no further: {facts.damage}")
+                self._notify(f"{path} is not read any further: {facts.damage}")
 
     def _open(self, path: Path) -> tuple[FileFacts, FileReader, int]:
         facts = FileFacts(path)
@@ -122,5 +122,5 @@ class FollowedRecordings:
 
 
 def _writer_of(path: Path) -> str:
-    """Return the common part of the names of one process's files: an episode may continue in its next file."""
+    """Return the common part of one process's file names: an episode may continue in its next file."""
     return str(path.with_name(path.name.rpartition("-")[0])) if FILE_NAME.match(path.name) else str(path)

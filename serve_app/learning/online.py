@@ -1,4 +1,4 @@
-"""Online learning: served robots' episodes train the next version, and it is proven before any robot gets it.
+"""Online learning: episodes of served robots train the next version, which is proven before a robot gets it.
 
 episodes of recordings -> admission -> learner -> every K updates: checkpoint, gate, publication, alias
 """
@@ -23,9 +23,9 @@ from rlservo.serve_app.learning.run_folder import RunFolder
 from rlservo.serve_app.recording.episodes import Episode
 
 POLL_S = 0.5
-KEPT_LOADED = 3  # versions besides those that may be learned from: robots finish their episodes with them
+KEPT_LOADED = 3  # versions kept besides those that may be learned from: robots finish their episodes with them
 GATE = (ParityError, CheckpointError, UnsupportedError, BundleError)
-"""The errors by which an export refuses a version."""
+"""The errors with which an export refuses a version."""
 
 
 @dataclass
@@ -43,7 +43,7 @@ class _Batch:
 
 
 class OnlineLearning:
-    """One run, from its beginning or from where its folder stands."""
+    """One run, new or resumed from its folder."""
 
     def __init__(
         self,
@@ -65,13 +65,13 @@ class OnlineLearning:
         self._say, self._progress, self._sleep = say, progress, sleep
         self._used = {(file, key) for file, keys in run.state.used.items() for key in keys}
         self._unproven: list[str] = []
-        """Episodes that were learned from since the newest version, by key."""
+        """Episodes learned from since the newest version, by key."""
         self._fresh = 0
-        """The same, counted: a recorded episode may be several."""
+        """Their number: a recorded episode may be several."""
         self._source = self._admitted()
 
     def run(self, versions: int | None = None) -> None:
-        """Learn until this number of further versions was released, or interrupted. Raises RlservoError."""
+        """Learn until this number of further versions has been released, or until interrupted. Raises RlservoError."""
         state = self._run.state
         if self._run.is_new:
             self._release.check_unclaimed()
@@ -81,7 +81,7 @@ class OnlineLearning:
             self._learner.restore(self._run.checkpoint(state.versions[-1].version))
             self._serve_newest()
             newest = state.versions[-1].version
-            self._say(f"continues from version {newest}: {state.updates} updates, {state.episodes} episodes used")
+            self._say(f"continuing from version {newest}: {state.updates} updates, {state.episodes} episodes used")
         released = 0
         while versions is None or released < versions:
             for _ in range(self._every):
@@ -103,7 +103,7 @@ class OnlineLearning:
         return True
 
     def _keep(self, known: KnownVersion) -> bool:
-        """Note a version, and let robots have it; return whether they do."""
+        """Record a version, and serve it to robots; return whether they get it."""
         state = self._run.state
         state.versions.append(known)
         self._run.commit(self._recordings.names())
@@ -118,9 +118,9 @@ class OnlineLearning:
         return True
 
     def _serve_newest(self) -> bool:
-        """Let robots have the newest version; continue without it if the server or its canary refused it.
+        """Serve the newest version to robots; continue without it if the server or its canary refused it.
 
-        Raises UsageError if it is the first, the checkpoint itself.
+        Raises UsageError if it is the first version, the checkpoint itself.
         """
         versions = self._run.state.versions
         newest = versions[-1].version
@@ -135,10 +135,10 @@ class OnlineLearning:
         return False
 
     def _refuse(self, why: str) -> None:
-        """Learn on from the last version, without what was learned since."""
+        """Continue from the last version, discarding the updates since."""
         state = self._run.state
         newest = state.versions[-1].version
-        self._say(f"no version was released, {why}")
+        self._say(f"no version was released: {why}")
         self._learner.restore(self._run.checkpoint(newest), forget=self._fresh)
         state.unproven += self._unproven
         self._forget_unproven()
@@ -175,7 +175,7 @@ class OnlineLearning:
         )
 
     def _draw(self) -> _Batch:
-        """Return the episodes of the next update; wait for them."""
+        """Wait for the episodes of the next update and return them."""
         batch = _Batch()
         wanted = self._learner.steps_wanted
         while batch.steps < wanted:
@@ -194,7 +194,7 @@ class OnlineLearning:
         return batch
 
     def _admitted(self) -> Iterator[Admitted | str | None]:
-        """Yield an episode, or the reason against it; None if no more have ended yet."""
+        """Yield an episode, or the reason to drop it; None if no more have ended yet."""
         state = self._run.state
         while True:
             for ended in self._recordings.poll():
@@ -213,7 +213,7 @@ class OnlineLearning:
             yield None
 
     def _remember(self, key: str, parts: Sequence[Episode]) -> None:
-        """Give an episode of before a restart back to a learner that replays."""
+        """Return an episode from before a restart to a learner that replays."""
         state = self._run.state
         if not self._learner.replays or key in state.unproven:
             return
@@ -229,7 +229,7 @@ def _made(one: Admitted, id_: str) -> Any:
 
 
 def why_interrupted(run: RunFolder) -> str:
-    """Return the sentence about a run that was stopped."""
+    """Return the message about a stopped run."""
     versions = run.state.versions
     after = f"with version {versions[-1].version}" if versions else "before its first version"
-    return f"stopped {after}; the same command continues"
+    return f"stopped {after}; the same command resumes it"

@@ -1,4 +1,4 @@
-"""Release of a version to a server: proven, published, loaded, and named by an alias or promoted by a canary."""
+"""Release of a version to a server: prove, publish and load it, then move an alias or promote it by a canary."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.repository.publication import next_version, publish
 
 RETRY_S = 2.0
-ATTEMPTS = 5  # at a version's number, each after another publisher has taken one
+ATTEMPTS = 5  # to get a version number, each after another publisher has taken one
 
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class Canary:
-    """How a version is watched before all robots get it."""
+    """Conditions under which a version is watched before all robots get it."""
 
     share: float
-    """Of the sessions."""
+    """Share of the sessions."""
     seconds: float
     limits: Limits
     every_s: float = 5.0
@@ -54,14 +54,14 @@ class Target:
 
     policy: str
     repository: str
-    """A folder or URI, one of the server's."""
+    """A folder or URI, one of the server's repositories."""
     alias: str
     canary: Canary | None = None
-    """Where given, versions go to production through a canary, and no alias is moved."""
+    """If given, versions go to production through a canary, and no alias is moved."""
 
 
 class Release:
-    """Brings versions of one run to its server."""
+    """Releases versions of one run to its server."""
 
     def __init__(
         self,
@@ -74,27 +74,27 @@ class Release:
         progress: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`connect` makes a client of `url` with the admin key as it is then; `progress` takes the current activity."""
+        """`connect` makes a client of `url` with the current admin key; `progress` takes the current activity."""
         self._target, self._run, self._connect = target, run, connect
         self._url, self._reward = url, ""
         self._app_dir, self._progress, self._sleep = app_dir, progress, sleep
 
     def named_reward(self) -> Reward | None:
-        """Return the reward function that the served policy's contract names, as this run's contracts then do.
+        """Return the reward function that the served policy's contract names, for this run's contracts too.
 
-        None where it names none. Raises UsageError where it cannot be loaded.
+        None if it names none. Raises UsageError if it cannot be loaded.
         """
 
         def ask() -> str:
             with self._connect() as client:
                 return str(client.contract(self._target.policy).get("reward", ""))
 
-        with suppress(UnknownPolicyError):  # served from its first version on
+        with suppress(UnknownPolicyError):  # not served before its first version
             self._reward = self._until_reached(ask)
         return named_reward(self._reward) if self._reward else None
 
     def publish(self, save: Callable[[Path], None]) -> KnownVersion:
-        """Save a checkpoint under the next version's number, prove it and publish it.
+        """Save a checkpoint under the next version number, prove it and publish it.
 
         Raises ParityError and others if the gate refuses it; then nothing is published.
         """
@@ -111,27 +111,27 @@ class Release:
             bundle = load_bundle(result.path)
             try:
                 self._until_reached(partial(publish, bundle, place))
-            except ConflictError:  # another publisher was faster
+            except ConflictError:  # another publisher took this number
                 continue
             return _known(bundle)
-        raise UsageError(f"{place}/{name}: others keep publishing versions; give the same command again")
+        raise UsageError(f"{place}/{name}: other publishers keep taking the next version: run the command again")
 
     def check_unclaimed(self) -> None:
-        """Raise ConflictError if a new run's alias already points to a version: another learner may move it."""
+        """Raise ConflictError if a new run's alias already points to a version, as another learner may move it."""
         name, alias = self._target.policy, self._target.alias
         there = None if self._target.canary else self._until_reached(lambda: self._aliases().get(alias))
         if there is not None:
             raise ConflictError(
-                f"alias '{alias}' of policy '{name}' already leads to version {there}: is another learner moving it? "
-                f"Give this one its own --alias, or remove a left-over one with 'rlservo policy alias {name} {alias}='"
+                f"alias '{alias}' of policy '{name}' already points to version {there}: is another learner moving it? "
+                f"Give this run its own --alias, or remove a stale alias with 'rlservo policy alias {name} {alias}='"
             )
 
     def serve(self, version: str, before: str | None) -> str | None:
-        """Let the server load a version and robots have it; done already, it changes nothing.
+        """Load a version on the server and serve it to robots; if already done, this changes nothing.
 
-        `before` is where this run has let the alias lead, None at its first version. Returns why the server refused the
-        version or its canary was rolled back, None where robots have it. Raises ConflictError where someone else
-        changes what is served.
+        `before` is the version to which this run last moved the alias, None at first. Returns why the server refused
+        the version or rolled its canary back, None if robots get it. Raises ConflictError if someone else changes the
+        alias.
         """
         try:
             self._until_reached(lambda: self._load(version))
@@ -143,7 +143,7 @@ class Release:
         return None
 
     def unload(self, version: str) -> None:
-        """Let the server unload a version that robots no longer need, unless something still points to it."""
+        """Unload a version that robots no longer need, unless something still points to it."""
         try:
             with self._connect() as client:
                 client.unload(self._target.policy, version)
@@ -166,14 +166,14 @@ class Release:
             return
         if there not in (None, before):
             raise ConflictError(
-                f"alias '{alias}' of policy '{name}' leads to version {there}, but this run had moved it to "
-                f"{before}: is another learner moving it? Give each its own --alias"
+                f"alias '{alias}' of policy '{name}' points to version {there}, but this run had moved it to {before}: "
+                "is another learner moving it? Give each run its own --alias"
             )
         with self._connect() as client:
             client.alias(name, alias, version, expected=there)
 
     def _promote(self, version: str, canary: Canary) -> str | None:
-        """Put a version into production by `rlservo policy promote`, from where its log ends."""
+        """Put a version into production as `rlservo policy promote` does, resuming from its log."""
         name, log = self._target.policy, self._run.path / "promotions" / f"{version}.jsonl"
         if self._until_reached(lambda: self._aliases().get(PRODUCTION)) == version:
             return None
@@ -184,7 +184,7 @@ class Release:
                 outcome = Promotion(
                     lambda _url: self._connect(), terms, opened, every_s=canary.every_s, say=self._progress
                 ).run()
-            except UsageError as error:  # another canary, say: another learner's
+            except UsageError as error:  # for example another learner's canary
                 raise ConflictError(f"version {version} was not promoted: {error.message}") from None
         if outcome.outcome == INTERRUPTED:
             raise KeyboardInterrupt
@@ -193,12 +193,12 @@ class Release:
         return outcome.why if outcome.outcome == ROLLED_BACK else None
 
     def _until_reached(self, change: Callable[[], Result]) -> Result:
-        """Return the result of `change`, tried until the server or the storage is reachable."""
+        """Return the result of `change`, which is retried until the server or the storage is reachable."""
         while True:
             try:
                 return change()
             except (UnavailableError, DeadlineError) as error:
-                self._progress(f"waiting until it can be released: {error.message}")
+                self._progress(f"waiting to release the version: {error.message}")
             self._sleep(RETRY_S)
 
 

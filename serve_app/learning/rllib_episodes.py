@@ -1,6 +1,6 @@
-"""Recorded episodes as RLlib's `SingleAgentEpisode`, and through a checkpoint's own connectors.
+"""Recorded episodes as RLlib's `SingleAgentEpisode`, passed through a checkpoint's own connectors.
 
-Both ways back into training use it: `examples/learn_from_recordings.py`, offline, and `rlservo learn`.
+Used by offline training (`examples/learn_from_recordings.py`) and by `rlservo learn`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from rlservo.serve_app.recording.episodes import Columns, Episode
 from rlservo.serve_app.recording.own_actions import OwnActions, modes, own_actions
 from rlservo.serve_app.recording.reader import Recording
 
-AT_ONCE = 256  # episodes in a pipeline's pass
+AT_ONCE = 256  # episodes per pass of a pipeline
 CANNOT_LEARN = ("FrameStacking",)
-"""Pieces that add nothing to the episode: a learner would need a second one."""
+"""Connector pieces that add nothing to the episode, so that a learner would need a second one."""
 
 
 @dataclass
@@ -35,15 +35,15 @@ class Recorded:
 
     contract: Any
     episodes: list[SingleAgentEpisode] = field(default_factory=list)
-    """As `env.step` fills them; not through connectors yet."""
+    """In the form that `env.step` gives; not yet passed through connectors."""
     not_used: dict[str, int] = field(default_factory=dict)
-    """Episodes that could not be used, by the reason."""
+    """Unusable episodes, by reason."""
     own: int = 0
     """Decisions whose own action was recorded."""
     inverted: int = 0
     """Decisions whose own action is the inverse of the executed one."""
     clipped: int = 0
-    """Number of those at a bound, or anywhere beyond it."""
+    """Number of those at or beyond a bound."""
 
     @property
     def decisions(self) -> int:
@@ -56,20 +56,20 @@ class Recorded:
 
 @dataclass(frozen=True)
 class Choice:
-    """Choice of episodes, and of the actions learned from them."""
+    """Selection of episodes, and of the actions to learn from them."""
 
     rewards: bool = True
-    """Whether the learner needs rewards, and the observation after an episode that was cut off."""
+    """Whether the learner needs rewards, and the observation after the end of a truncated episode."""
     status: str | None = None
     """Only episodes with this final status."""
     modes: bool = False
-    """Whether the most likely action of a recorded distribution is learned, not the one that was drawn."""
+    """Whether to learn the most likely action of a recorded distribution instead of the drawn one."""
     ahead: int = 0
-    """Learn for an observation the action of this many cycles later."""
+    """Number of cycles by which the action learned for an observation comes later."""
 
 
 def read_recordings(recording: Recording, choice: Choice | None = None, *, name: str | None = None) -> Recorded:
-    """Return the whole episodes of one policy that can be learned from.
+    """Return the whole episodes of one policy that are usable for learning.
 
     Raises UsageError if none can be used, and RecordingError.
     """
@@ -91,7 +91,7 @@ def read_recordings(recording: Recording, choice: Choice | None = None, *, name:
 
 
 def why_not_whole(episode: Episode) -> str | None:
-    """Return the part of its decisions or end that an episode lacks; None if it is whole."""
+    """Return the missing part of an episode; None if it is whole."""
     if not episode.id or not episode.begins or episode.gap is not None:
         return "without their beginning or with a gap"
     if episode.goes_on:
@@ -100,7 +100,7 @@ def why_not_whole(episode: Episode) -> str | None:
 
 
 def why_without_reward(episode: Episode, rewards: NDArray[np.float64]) -> str | None:
-    """Return the reason why an episode's return is unknown; None if it is known."""
+    """Return the reason why an episode's return is unknown, or None."""
     if not (np.abs(rewards) <= np.finfo(np.float32).max).all():  # the learner computes in float32
         return "without every reward"
     if not episode.terminated and episode.final_obs is None:
@@ -117,17 +117,16 @@ def single_agent_episode(
     ahead: int = 0,
     with_distribution: bool = False,
 ) -> SingleAgentEpisode:
-    """Return a whole episode as `env.step` would have filled RLlib's; not through connectors yet.
+    """Return a whole episode in RLlib's form as from `env.step`, not yet passed through connectors.
 
-    `own` are the module's own actions, leaves `[rows, *shape]`, row i + `ahead` is observation i's. With
-    `with_distribution` the episode also holds the acting module's other outputs: `action_logp`,
-    `action_dist_inputs`.
+    `own` are the module's own actions, leaves `[rows, *shape]`; row i + `ahead` belongs to observation i. With
+    `with_distribution` the episode also has the acting module's other outputs: `action_logp`, `action_dist_inputs`.
     """
     contract = episode.policy.contract
     rows = range(len(episode))
     final = episode.final_obs
     seen = [row_of(contract.observation_space, episode.obs, row, "obs") for row in rows]
-    # The value of what follows a terminated episode is 0, whatever it looks like.
+    # The value after a terminated episode is 0, whatever the observation.
     seen.append(seen[-1] if final is None else row_of(contract.observation_space, final, 0, "obs"))
     extra: dict[str, Any] = {}
     if with_distribution:
@@ -160,7 +159,7 @@ def _why_not(episode: Episode, own: OwnActions, choice: Choice) -> str | None:
     if choice.status is not None and episode.final_status != choice.status:
         return f"that did not end in {choice.status!r}"
     if not own.known.all():
-        return "in which the module's own actions are not all known"
+        return "without all of the module's own actions"
     return why_without_reward(episode, episode.reward) if choice.rewards else None
 
 
@@ -175,15 +174,15 @@ def _add(recorded: Recorded, episode: Episode, own: OwnActions, ahead: int) -> N
 def through_connectors(
     episodes: Sequence[SingleAgentEpisode], env_to_module: Any, *, learn: bool = False
 ) -> list[SingleAgentEpisode]:
-    """Return the episodes as RLlib's environment runner would have left them, with the network's observations.
+    """Return the episodes in the form that RLlib's environment runner gives, with the network's observations.
 
-    The pipeline's own pieces run step by step, and filters change only to `learn`. Raises UsageError for a piece that
-    leaves nothing in the episode.
+    The pipeline's own pieces run step by step, and filters are updated only with `learn`. Raises UsageError for a piece
+    that adds nothing to the episode.
     """
     pieces = [piece for piece in env_to_module.connectors if type(piece).__name__ not in PLUMBING]
     for piece in pieces:
         if type(piece).__name__ in CANNOT_LEARN:
-            raise UsageError(f"policies behind {type(piece).__name__} cannot be learned from recordings")
+            raise UsageError(f"policies with the connector {type(piece).__name__} cannot learn from recordings")
         if type(piece).__name__ == "MeanStdFilter":
             private_names.replace(piece, "_update_stats", learn)
     done: list[SingleAgentEpisode] = []

@@ -1,7 +1,7 @@
-"""RLlib's learner of a checkpoint, without its algorithm: no environment, no runner, no Ray that is started.
+"""RLlib's learner of a checkpoint without its algorithm: no environment, no runner, no running Ray.
 
 An update takes whole episodes as the acting version's network saw them. The observation filter belongs to acting: its
-statistics grow with the updates, and act from the next saved version on.
+statistics grow with the updates, and take effect in the next saved version.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from rlservo.serve_app.learning.rllib_episodes import through_connectors
 from rlservo.serve_app.learning.rllib_replay import Replay
 
 ALGORITHMS = {"PPO": 1, "APPO": 3, "SAC": 10}
-"""The oldest version that each learns from by default, in versions behind the newest: PPO clips the ratio to it, APPO
-corrects by V-trace, SAC replays."""
+"""Default age of the oldest version that each learns from, in versions behind the newest: PPO clips the ratio to it,
+APPO corrects with V-trace, SAC replays."""
 LEARNER_GROUP = "learner_group"
 
 
 class OnlineLearner:
-    """The learner after the updates so far."""
+    """A checkpoint's learner with its updates so far."""
 
     def __init__(self, start: Path, *, batch_size: int | None = None) -> None:
-        """Restore the checkpoint `start`; `batch_size` is the steps of an update, else the checkpoint's own.
+        """Restore the checkpoint `start`; `batch_size` is the number of steps per update; the checkpoint's by default.
 
         Raises CheckpointError, UnsupportedError and UsageError.
         """
         self._files = _files_of(start)
         algorithm, self._config = _config_of(self._files)
         self.max_age = ALGORITHMS[algorithm]
-        """Versions that may have come after the one that acted, by default."""
+        """Default number of versions that may have followed the one that acted."""
         self._replay = Replay(self._config) if algorithm == "SAC" else None
         self._epochs = _epochs(self._config)
         self.batch_size = batch_size or self._config.total_train_batch_size
@@ -54,7 +54,7 @@ class OnlineLearner:
         named: Any = {INPUT_ENV_SPACES: spaces, INPUT_ENV_SINGLE_SPACES: spaces, DEFAULT_MODULE_ID: spaces}
         try:
             self._group = self._config.build_learner_group(spaces=named)
-        except Exception as error:  # the configuration may name anyone's code
+        except Exception as error:  # the configuration may name third-party code
             raise CheckpointError(f"{start}: its learner cannot be built: {first_line(error)}") from error
         self._first_steps = read_facts(self._files.root, lambda _sentence: None).env_steps or 0
         self._acting: dict[Path, EnvToModulePipeline] = {}
@@ -63,16 +63,16 @@ class OnlineLearner:
 
     @property
     def replays(self) -> bool:
-        """Whether episodes are learned from again and again."""
+        """Whether episodes are learned from repeatedly."""
         return self._replay is not None
 
     @property
     def steps_wanted(self) -> int:
-        """Steps of new episodes that the next update takes."""
+        """Number of steps of new episodes that the next update needs."""
         return max(self.batch_size, self._replay.missing if self._replay else 0)
 
     def remember(self, seen: Sequence[SingleAgentEpisode]) -> None:
-        """Take episodes back that were learned from before a restart."""
+        """Take back the episodes that were learned from before a restart."""
         if self._replay is not None:
             self._replay.add(seen)
 
@@ -85,12 +85,12 @@ class OnlineLearner:
             self._replay.forget(forget)
         try:
             self._group.restore_from_path(str(checkpoint.absolute() / LEARNER_GROUP))
-        except Exception as error:  # a damaged file raises almost anything
+        except Exception as error:  # a damaged file can raise any exception
             raise CheckpointError(f"{checkpoint} cannot be restored: {first_line(error)}") from error
         self._env_to_module = self._pipeline(checkpoint)
 
     def seen(self, episodes: Sequence[SingleAgentEpisode], acting: Path) -> list[SingleAgentEpisode]:
-        """Return episodes as the network of the checkpoint `acting` saw them; its filter stays as it is."""
+        """Return episodes as the network of the checkpoint `acting` saw them; its filter is not changed."""
         if acting not in self._acting:
             self._acting[acting] = self._pipeline(acting)
         return through_connectors(episodes, self._acting[acting])
@@ -102,7 +102,7 @@ class OnlineLearner:
     def update(
         self, raw: Sequence[SingleAgentEpisode], seen: Sequence[SingleAgentEpisode], steps: int
     ) -> dict[str, float]:
-        """Learn once from episodes as networks `seen` them; `raw` ones feed the filter. Return losses by name.
+        """Learn once from the episodes `seen` by networks; `raw` ones update the filter. Return losses by name.
 
         `steps` are the environment steps learned from before. Raises RlservoError with the cause.
         """
@@ -115,7 +115,7 @@ class OnlineLearner:
             at = self._first_steps + steps + new * number // count
             try:
                 found = self._learn(list(seen) if replay is None else replay.draw(), at)
-            except Exception as error:  # the user's own learner or connectors among it
+            except Exception as error:  # including the user's own learner or connectors
                 raise RlservoError(f"learning failed: {first_line(error)}") from error
         through_connectors(raw, self._env_to_module, learn=True)
         return {name: float(np.asarray(found[name].peek())) for name in found if "loss" in name}
@@ -125,7 +125,7 @@ class OnlineLearner:
         config = cast(Any, self._config)
 
         def step(learner: Learner, *_: Any) -> Any:
-            # APPO's own `update` hands a batch to a thread, which calls this one, and does not wait for it.
+            # APPO's own `update` passes a batch to a thread, which calls this method, and does not wait for it.
             update = Learner.update if isinstance(learner, IMPALALearner) else type(learner).update
             return update(
                 learner,
@@ -141,7 +141,7 @@ class OnlineLearner:
         return found[DEFAULT_MODULE_ID]
 
     def save(self, folder: Path) -> None:
-        """Write a checkpoint of the whole algorithm: RLlib trains on from it, and `rlservo export` takes it.
+        """Write a checkpoint of the whole algorithm: RLlib can resume from it, and `rlservo export` accepts it.
 
         Its counters of iterations and environment steps are the first checkpoint's.
         """
@@ -172,29 +172,29 @@ def _files_of(checkpoint: Path) -> CheckpointFiles:
     files = locate_checkpoint(checkpoint)
     if not isinstance(files, CheckpointFiles) or not files.has_pipelines or files.is_one_of_several:
         raise UnsupportedError(
-            f"{checkpoint}: expected a checkpoint of RLlib's new API stack, of one agent, with its connectors"
+            f"{checkpoint}: expected a checkpoint of RLlib's new API stack, with one agent and its connectors"
         )
     if not (files.root / CTOR_FILE).is_file():
         raise UsageError(
-            f"{checkpoint} was pruned, or is a module alone: learning continues from a whole checkpoint, with its "
-            "configuration and its optimizer"
+            f"{checkpoint} was pruned, or is only a module: expected a whole checkpoint, with configuration and "
+            "optimizer"
         )
     return files
 
 
 def _epochs(config: Any) -> int:
-    """Return how often a batch is learned from: of APPO also as often as its buffer would give it out."""
+    """Return how often a batch is learned from; for APPO including its buffer's repetitions."""
     rounds = config.circular_buffer_iterations_per_batch if getattr(config, "use_circular_buffer", False) else 1
     return int(config.num_epochs * rounds)
 
 
 def _config_of(files: CheckpointFiles) -> tuple[str, AlgorithmConfig]:
-    """Return the algorithm's name and its configuration."""
+    """Return the algorithm's name and configuration."""
     opened = unpickle(files.root / CTOR_FILE)
     algorithm = opened["class"]
     if algorithm.__name__ not in ALGORITHMS:
         raise UnsupportedError(
-            f"{files.root} is of {algorithm.__name__}: online learning supports {', '.join(ALGORITHMS)}; "
+            f"{files.root} is a checkpoint of {algorithm.__name__}: online learning supports {', '.join(ALGORITHMS)}; "
             "examples/learn_from_recordings.py learns offline"
         )
     args, kwargs = opened["ctor_args_and_kwargs"]

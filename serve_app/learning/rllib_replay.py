@@ -1,6 +1,6 @@
-"""Replay buffer of an off-policy learner: the newest episodes, drawn as RLlib's own algorithms draw their transitions.
+"""Replay buffer of an off-policy learner: transitions of the newest episodes, drawn as in RLlib's own algorithms.
 
-Transitions are drawn evenly, also where the checkpoint's configuration asks for priorities.
+Transitions are drawn uniformly, even if the checkpoint's configuration asks for priorities.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class Replay:
     """Episodes as the network saw them, up to the configuration's capacity in steps."""
 
     def __init__(self, config: Any) -> None:
-        """Take the sizes of an off-policy algorithm's configuration."""
+        """Take the sizes from an off-policy algorithm's configuration."""
         self._config = config
         self._capacity = int(config.replay_buffer_config["capacity"])
         self._kept: deque[SingleAgentEpisode] = deque()
@@ -25,11 +25,11 @@ class Replay:
 
     @property
     def missing(self) -> int:
-        """Steps that the configuration wants to see before anything is learned."""
+        """Number of steps still missing before learning starts, by the configuration."""
         return max(0, int(self._config.num_steps_sampled_before_learning_starts) - sum(map(len, self._kept)))
 
     def add(self, episodes: Sequence[SingleAgentEpisode]) -> None:
-        """Take the newest episodes in, and drop the oldest beyond the capacity."""
+        """Add the newest episodes, and drop the oldest beyond the capacity."""
         self._kept += episodes
         while sum(map(len, self._kept)) > self._capacity and len(self._kept) > 1:
             self._kept.popleft()
@@ -44,7 +44,7 @@ class Replay:
             self._buffer.add(list(self._kept))
 
     def updates(self, steps: int) -> int:
-        """Return how often to learn for so many new steps: `training_intensity`, or once for each sampling."""
+        """Return the number of updates for this many new steps: by `training_intensity`, or one per sampling."""
         config = self._config
         sampled = config.get_rollout_fragment_length() * config.num_envs_per_env_runner * max(1, config.num_env_runners)
         per_step: float = (config.training_intensity or 0) / config.total_train_batch_size or 1 / sampled

@@ -1,7 +1,7 @@
-"""Folder of an online learning run: its versions, used episodes and lock. It can always be resumed.
+"""Folder of an online learning run: versions, used episodes and lock. A run can always be resumed.
 
-`learn.json` is replaced at once, and names the newest version that was made, proven and published. Anything learned
-after it is learned again, from the same episodes: those count as used only from the version on that holds them.
+`learn.json` is replaced atomically, and names the newest version that was made, proven and published. Later updates are
+learned again from the same episodes, which count as used only once a version includes them.
 """
 
 from __future__ import annotations
@@ -29,27 +29,27 @@ class State:
     """State of a run at its newest version."""
 
     terms: dict[str, Any]
-    """Settings that must not change between two starts of a run."""
+    """Settings that must not change between starts of a run."""
     versions: list[KnownVersion] = field(default_factory=list)
-    """In their order, the newest last."""
+    """The versions in order, the newest last."""
     updates: int = 0
     episodes: int = 0
     steps: int = 0
     used: dict[str, list[str]] = field(default_factory=dict)
-    """The episodes that were learned from or dropped, by the file with their end."""
+    """The used and dropped episodes, by the file that has their end."""
     dropped: Counter[str] = field(default_factory=Counter)
-    """Episodes by the reason why nothing was learned from them."""
+    """Number of dropped episodes, by reason."""
     refused: int = 0
     """Versions that the gate refused, or whose canary was rolled back."""
     unproven: list[str] = field(default_factory=list)
-    """The used episodes that those had learned from."""
+    """The used episodes of the refused versions."""
 
 
 class RunFolder(Closeable):
-    """One run's folder, held by one process."""
+    """A run's folder, locked by one process."""
 
     def __init__(self, path: Path, terms: dict[str, Any], reward_source: str | None) -> None:
-        """Make the folder, or resume the run in it. Raises UsageError if another holds it or settings differ."""
+        """Make the folder, or resume its run. Raises UsageError if another process holds it or settings differ."""
         self.path = path.absolute()
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -78,7 +78,7 @@ class RunFolder(Closeable):
         return self.path / "bundles"
 
     def checkpoint(self, version: str) -> Path:
-        """Return the checkpoint that a version was exported from."""
+        """Return the checkpoint from which a version was exported."""
         return self.path / "checkpoints" / version
 
     def begin(self, name: str, version: str) -> Path:
@@ -89,7 +89,7 @@ class RunFolder(Closeable):
         return self.checkpoint(version)
 
     def commit(self, present: Collection[str]) -> None:
-        """Write the state, without files that are no longer `present`."""
+        """Write the state, leaving out files that are no longer `present`."""
         state = self.state
         state.used = {file: keys for file, keys in state.used.items() if file in present}
         part = self.path / f"{STATE_FILE}.part"
@@ -104,7 +104,7 @@ class RunFolder(Closeable):
         os.close(self._lock)
 
     def _check_ours(self) -> None:
-        """Raise UsageError for a folder with other content than a run's."""
+        """Raise UsageError for a folder with content that is not a run's."""
         ours = {LOCK_FILE, REWARD_FILE, STATE_FILE, f"{STATE_FILE}.part", *FOLDERS}
         others = sorted({entry.name for entry in self.path.iterdir()} - ours)
         if others:
@@ -126,8 +126,8 @@ class RunFolder(Closeable):
         if changed is not None:
             raise UsageError(
                 f"--out {self.path} is a run with {changed} {state.terms.get(changed)!r}, not {terms[changed]!r}: "
-                "give the same again, or a new --out"
+                "give the same value, or a new --out"
             )
         if (shown.read_text() if shown.exists() else None) != reward_source:
-            raise UsageError(f"--reward is not what this run began with ({shown}): give the same, or a new --out")
+            raise UsageError(f"--reward differs from this run's first one ({shown}): give the same, or a new --out")
         return state

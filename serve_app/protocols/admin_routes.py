@@ -1,8 +1,8 @@
 """Administration over HTTP: load, unload, alias, rollback, canary, shadow.
 
-A command answers when the change is proven, written into the repository's plan, and served by the process that took
-it; the other processes follow. `access_checks.authorize` admits no one without an admin key. The Open Inference
-Protocol's `load` and `unload` are two of these under other names.
+A command answers once the change is proven, written into the repository's plan, and served by the process that received
+it; the other processes follow. `access_checks.authorize` requires an admin key. The Open Inference Protocol's `load`
+and `unload` are two of these commands under other names.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
 
         return answer
 
-    # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: it is not read. As a
-    # Triton that serves what its configuration pins: loading changes what clients get only where the model was not
-    # there at all. Moving `production` is /v1/admin's, with a way back.
+    # Triton's clients send a body, as JSON or as octets, whose parameters mean nothing here: it is not read. As on a
+    # Triton with pinned versions, loading changes what clients get only if the model was not served at all. Moving
+    # `production` is left to /v1/admin, which has a rollback.
     def repository(kind: type[Load | Unload]) -> Answer:
         async def answer(call: Call) -> tuple[bytes, Headers]:
             check_media_type(call.headers, JSON, BINARY, optional=True)
@@ -55,9 +55,9 @@ def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
         return answer
 
     admin, model = "/v1/admin/policies", "/v2/repository/models/{name}"
-    load, unload = "Load a model's newest version", "Unload a model, all its versions"
+    load, unload = "Load a model's newest version", "Unload all versions of a model"
     return [
-        Route(GET, admin, Access.admin, "Policies and versions served by the process that answers, in a list", status),
+        Route(GET, admin, Access.admin, "List of the policies and versions served by the answering process", status),
         *(
             Route(POST, f"{admin}/{{name}}/{command}", Access.admin, kind.summary, commanded(command))
             for command, kind in COMMANDS.items()

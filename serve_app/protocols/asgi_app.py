@@ -37,9 +37,9 @@ def create_app(
 ) -> PolicyApp:
     """Return the application; `store_provider` gives None for as long as the policies are being loaded.
 
-    With a `control` what is served can be administered. `replica` is the `RequestHandler`'s; `host` is the address that
-    is listened on; `is_behind_serve` is `PolicyApp`'s; `is_alone` says that this is the only process that requests
-    reach. Raises UsageError when the API keys that `settings` name cannot be read.
+    A `control` makes the served policies administrable. `replica` is the `RequestHandler`'s; `host` is the address that
+    it listens on; `is_behind_serve` is `PolicyApp`'s; `is_alone` says that requests reach only this process. Raises
+    UsageError when the API keys that `settings` name cannot be read.
     """
     handler = RequestHandler(store_provider, settings, replica=replica, control=control, is_alone=is_alone)
     checks = AccessChecks(Hosts(host, settings, keyed=bool(handler.keys.accepted.keys)), handler.keys)
@@ -65,6 +65,6 @@ def _health(handler: RequestHandler) -> list[Route]:
         return await exposition(handler), ((b"content-type", CONTENT_TYPE_LATEST.encode()),)
 
     return [
-        Route(GET, "/healthz", Access.open, "The process answers", healthz),
+        Route(GET, "/healthz", Access.open, "The process is alive", healthz),
         Route(GET, "/metrics", Access.act, "Metrics for Prometheus", metrics),
     ]

@@ -1,6 +1,6 @@
-"""The API's documentation at /docs and /openapi.json, from this machine alone: no CDN.
+"""API documentation at /docs and /openapi.json, served entirely by this machine: no CDN.
 
-The page is Swagger UI, whose files the package `fastapi-offline` brings.
+The page is Swagger UI, whose files come with the package `fastapi-offline`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rlservo.serve_app.server.api_keys import Access
 
 MEDIA_TYPES = {".css": "text/css", ".js": "text/javascript", ".png": "image/png"}
 FILES = ("swagger-ui.css", "swagger-ui-bundle.js", "favicon.png")
-# Addresses are relative, so that the page also works behind a route prefix. No validator badge: it would ask
+# Addresses are relative, so that the page also works behind a route prefix. No validator badge: it would contact
 # validator.swagger.io.
 SCRIPT = """
 SwaggerUIBundle({url: "openapi.json", dom_id: "#swagger-ui", deepLinking: true, validatorUrl: null,
@@ -42,7 +42,7 @@ PAGE = f"""<!DOCTYPE html>
 SCRIPT_HASH = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
 HEADERS: Headers = (
     (b"content-type", b"text/html; charset=utf-8"),
-    # "Try it out" acts in the name of the visitor: no other page may put this one under its visitor's mouse.
+    # "Try it out" acts on the visitor's behalf: no other page may embed this one (clickjacking).
     (
         b"content-security-policy",
         f"default-src 'none'; script-src 'self' 'sha256-{SCRIPT_HASH}'; style-src 'self' 'unsafe-inline'; "
@@ -58,12 +58,12 @@ HEADERS: Headers = (
 def files_of_swagger_ui() -> Path:
     """Return the folder of Swagger UI's files."""
     found = importlib.util.find_spec("fastapi_offline")
-    assert found is not None and found.origin is not None  # the extra `serve` has it
+    assert found is not None and found.origin is not None  # part of the extra `serve`
     return Path(found.origin).parent / "static"
 
 
 def routes(table: Callable[[], RoutingTable]) -> list[Route]:
-    """Return the page, its files and the document of a table."""
+    """Return the routes of the page, its files and a table's document."""
     written: list[bytes] = []
 
     async def page(_call: Call) -> tuple[bytes, Headers]:
@@ -90,9 +90,9 @@ def routes(table: Callable[[], RoutingTable]) -> list[Route]:
 
     return [
         Route(GET, "/openapi.json", Access.open, "OpenAPI document", document, is_documented=False),
-        Route(GET, "/docs", Access.open, "The API, to read and to try", page, is_documented=False),
+        Route(GET, "/docs", Access.open, "Interactive API documentation", page, is_documented=False),
         *(
-            Route(GET, f"/docs/{name}", Access.open, "File of that page", file(name), is_documented=False)
+            Route(GET, f"/docs/{name}", Access.open, "File of the API documentation", file(name), is_documented=False)
             for name in FILES
         ),
     ]

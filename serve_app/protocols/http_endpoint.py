@@ -1,4 +1,4 @@
-"""Route and checks of every connection, then body and reply of a request for actions.
+"""Routing and checks of every connection; body and reply of requests for actions.
 
 Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more.
 """
@@ -61,12 +61,12 @@ numbers = itertools.count(1)
 
 
 class PolicyApp:
-    """The ASGI application: finds each connection's route, and checks who asks before anything of the body is read."""
+    """The ASGI application: finds each connection's route, and checks the client before it reads the body."""
 
     def __init__(
         self, handler: RequestHandler, checks: AccessChecks, table: RoutingTable, *, is_behind_serve: bool = False
     ) -> None:
-        """`is_behind_serve`: Ray Serve gives replies their request id, and its connections take trailers for headers"""
+        """`is_behind_serve`: Ray Serve adds the request id to replies, and its connections treat trailers as headers"""
         self.handler = handler
         self.table = table
         self._checks = checks
@@ -74,7 +74,7 @@ class PolicyApp:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one ASGI connection."""
-        if scope["type"] == "lifespan":  # an engine loads the policies
+        if scope["type"] == "lifespan":  # the engine loads the policies
             for phase in ("startup", "shutdown"):
                 await receive()
                 await send({"type": f"lifespan.{phase}.complete"})
@@ -100,7 +100,7 @@ class PolicyApp:
         await found.route.app(scope, receive, send)
 
     async def _answer(self, found: Found, path: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer where there is no route, or one that wants the whole body."""
+        """Answer if there is no route, or one that takes the whole body."""
         headers = scope[HEADERS]
         entry = AuditEntry(scope.get("method", ""), path, peer_of(scope), header_text(headers, REQUEST_ID))
         entry.is_administration = found.access is Access.admin
@@ -109,7 +109,7 @@ class PolicyApp:
             key = self._check(found, path, scope)
             entry.key = "" if key is None else key.label
             if scope["type"] == "websocket":
-                raise UnknownPolicyError(f"no stream is at {path[:200]}: connect to /v1/policies/NAME/stream")
+                raise UnknownPolicyError(f"there is no stream at {path[:200]}: connect to /v1/policies/NAME/stream")
             if found.route is None or found.route.answer is None:
                 status, entry.code, content, own = missing_route(entry.method, path, found.allowed)
             else:
@@ -128,7 +128,7 @@ class PolicyApp:
             entry.write()
 
     def _check(self, found: Found, path: str, scope: Scope) -> Key | None:
-        """Return the key that opens a route. Raises what `check_path` and `AccessChecks.check` raise."""
+        """Return the key that permits a route. Raises what `check_path` and `AccessChecks.check` raise."""
         check_path(scope, path)
         key = self._checks.check(scope, scope[HEADERS], found.access)
         if self._is_behind_serve and b"transfer-encoding" in scope[HEADERS]:
@@ -162,7 +162,7 @@ class HttpEndpoint:
     """Answers the POST requests of one protocol."""
 
     def __init__(self, protocol: str, codec: Codec[Receive, tuple[bytes, Headers]], handler: RequestHandler) -> None:
-        """Take the protocol's name, as metrics and log have it."""
+        """Take the protocol's name for metrics and logs."""
         self._protocol = protocol
         self._codec = codec
         self._handler = handler
@@ -178,7 +178,7 @@ class HttpEndpoint:
             label=header_text(headers, LABEL),
             request_id=header_text(headers, REQUEST_ID),
             headers=headers,
-            connection=client if (client := scope.get("client")) is not None and client[1] else None,  # a proxy's has 0
+            connection=client if (client := scope.get("client")) is not None and client[1] else None,  # 0: a proxy
             has_hung_up=partial(has_hung_up, receive),
             may_explore=scope[MAY_EXPLORE],
         )
@@ -193,9 +193,9 @@ class HttpEndpoint:
 
 
 async def has_hung_up(receive: Receive) -> bool:
-    """Return whether the client of a request that was read to its end has closed its connection.
+    """Return whether the client has closed its connection after sending a complete request.
 
-    The event loop takes a turn to read what arrived of that, one to close the connection, and two to report it here.
+    The event loop takes one turn to read the close, one to close the connection, and two to report it here.
     """
     message = asyncio.ensure_future(receive())
     for _ in range(HANG_UP_TURNS):
@@ -209,8 +209,8 @@ async def has_hung_up(receive: Receive) -> bool:
 async def receive_body(handler: RequestHandler, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
     """Return a request's body within the server's limits. The first message usually holds all of it.
 
-    The one way in which a body gets into this process; how long it may take is the connection's affair
-    (`engines/http_bounds.py`). Raises TooLargeError, OverloadedError and ClientGoneError.
+    Every body enters this process here; its time limit is enforced by the connection (`engines/http_bounds.py`). Raises
+    TooLargeError, OverloadedError and ClientGoneError.
     """
     max_bytes = handler.settings.max_body_bytes
     length = headers.get(b"content-length", b"")

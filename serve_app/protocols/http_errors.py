@@ -1,4 +1,4 @@
-"""HTTP status and body of each error, the same for every HTTP protocol; and a WebSocket's form of one."""
+"""HTTP status and body of each error, the same for every HTTP protocol, and errors on a WebSocket."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ logger = logging.getLogger(__name__)
 DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
 FAILED = 1011  # the close code openpi's server uses for every error
 
-STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first that fits; whatever does not fit is our fault: 500
+STATUS: tuple[tuple[type[RlservoError], int], ...] = (  # the first match counts; anything else is a bug of ours: 500
     (ObservationError, 422),
     (UnknownPolicyError, 404),
     (MediaTypeError, 415),
@@ -60,7 +60,7 @@ def too_large(limit: int) -> TooLargeError:
     return TooLargeError(f"the request body is larger than {limit} bytes", {"max_body_bytes": limit})
 
 
-# Errors: the one table above, and one body for all.
+# Errors: the table above, and one body format for all.
 
 
 def status_of(error: RlservoError) -> int:
@@ -69,7 +69,7 @@ def status_of(error: RlservoError) -> int:
 
 
 def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
-    """Return (status, body, headers) and log what is our own fault."""
+    """Return (status, body, headers), and log an error of our own."""
     status = status_of(error)
     headers = JSON_HEADERS
     if status == 503:
@@ -84,12 +84,12 @@ def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
 
 
 def retry_after_s(error: RlservoError) -> int:
-    """Return the whole seconds after which to ask again."""
+    """Return the whole seconds after which to retry."""
     return max(RETRY_AFTER_S, math.ceil(float(error.details.get("retry_after_s", 0))))
 
 
 def encode_error(error: RlservoError) -> bytes:
-    """Return the body of an error; the inside of the server stays inside."""
+    """Return the body of an error, without internal details."""
     if status_of(error) == 500 and not isinstance(error, ActionError):
         return encode_bug()
     document: dict[str, Any] = {"error": error.message, "code": error.code}
@@ -99,18 +99,18 @@ def encode_error(error: RlservoError) -> bytes:
 
 
 def encode_bug() -> bytes:
-    """Return the body of an error that is none of ours to explain to a client."""
+    """Return the body of an unexpected error, whose cause clients are not told."""
     return encode_json({"error": BUG, "code": "internal"})
 
 
 def missing_route(method: str, path: str, allowed: Sequence[str]) -> tuple[int, str, bytes, Headers]:
-    """Return (status, code, body, headers) where no route has the path, or only for the `allowed` methods."""
+    """Return (status, code, body, headers) if no route has the path, or only for the `allowed` methods."""
     shown, headers = path[:200], JSON_HEADERS
     if allowed:
         status, code, sentence = 405, "method-not-allowed", f"{method} is not what {shown} takes: {allowed[0]} is"
         headers += ((b"allow", ", ".join(allowed).encode()),)
     else:
-        status, code, sentence = 404, "not-found", f"nothing is at {shown}: policies are under /v1/policies"
+        status, code, sentence = 404, "not-found", f"there is nothing at {shown}: policies are under /v1/policies"
         if path == "/":  # a page for browsers
             headers += ((b"vary", b"Accept"),)
     return status, code, encode_json({"error": sentence, "code": code}), headers
@@ -119,8 +119,8 @@ def missing_route(method: str, path: str, allowed: Sequence[str]) -> tuple[int, 
 def check_media_type(headers: Mapping[bytes, bytes], *accepted: bytes, optional: bool = False) -> None:
     """Raise MediaTypeError unless the body is of an accepted content type.
 
-    A web page can send forms, plain text and bodies of no type to any server; for another type a browser asks the
-    server first. Triton's client names no type: `optional` lets through who does not, unless it is a browser.
+    A web page can send forms, plain text and bodies of no type to any server; for other types a browser asks the server
+    first. Triton's client names no type: `optional` accepts that, except from a browser.
     """
     given = headers.get(b"content-type")
     usage = f"send {accepted[0].decode()} (curl: -H 'content-type: {accepted[0].decode()}')"
@@ -149,7 +149,7 @@ async def send_error(send: Send, error: RlservoError, *, kind: str = "http.respo
 async def refuse_upgrade(
     scope: Scope, receive: Receive, send: Send, error: RlservoError, headers: Headers = ()
 ) -> None:
-    """Answer an upgrade with an HTTP error; if the server cannot send one, accept it and fail in our own way."""
+    """Answer an upgrade with an HTTP error; if the server cannot send one, accept it and send the error as a frame."""
     await receive()  # websocket.connect
     if DENIAL in scope.get("extensions", {}):
         await send_error(send, error, kind=DENIAL, headers=headers)
@@ -163,5 +163,5 @@ async def fail_stream(send: Send, content: bytes) -> None:
     try:
         await send({"type": "websocket.send", "text": content.decode()})
         await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
-    except (OSError, RuntimeError):  # the client has gone meanwhile
-        logger.debug("a stream's client went before its error could be sent")
+    except (OSError, RuntimeError):  # the client has disconnected
+        logger.debug("a stream's client disconnected before its error could be sent")

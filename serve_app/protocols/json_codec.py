@@ -1,7 +1,6 @@
 """JSON: body of an act request to `Request`, decision to a reply's body.
 
-Options, and what is said of the episode, are the same fields in MessagePack, and in the Open Inference Protocol's
-`parameters`.
+Options and episode fields are the same in MessagePack and in the Open Inference Protocol's `parameters`.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ SUCH_AS = '{"obs": [...]}'
 
 
 def routes(handler: RequestHandler) -> list[Route]:
-    """Return the routes of /v1: actions, and what is served."""
+    """Return the routes of /v1: actions, and the policies served."""
 
     async def policies(_call: Call) -> tuple[bytes, Headers]:
         return encode_json(listing.describe(handler)), JSON_HEADERS
@@ -72,12 +71,12 @@ class JsonCodec:
         encoding = headers.get(b"content-encoding")
         if encoding is not None and encoding.lower() != b"identity":
             raise MediaTypeError(
-                f"the content encoding '{encoding[:32].decode('latin-1')}' is not read: send plain JSON"
+                f"the content encoding '{encoding[:32].decode('latin-1')}' is not supported: send plain JSON"
             )
         return await receive_body(self._handler, headers, source)
 
     def parse(self, request: Request, content: Body) -> None:
-        """Fill the request; the observation itself is the policy's to judge.
+        """Fill the request; the policy checks the observation itself.
 
         Raises TooLargeError when the body holds more than `max_batch` observations can need, RequestError when it is
         not a JSON object of the known fields, ObservationError when it has no `obs`.
@@ -119,7 +118,7 @@ def parse_options(request: Request, document: Mapping[str, Any]) -> None:
 
 
 def parse_episode(document: Mapping[str, Any]) -> Episode | None:
-    """Return what a request says of its episode; None when it says nothing. Raises RequestError."""
+    """Return a request's episode fields; None if it has none. Raises RequestError."""
     if EPISODE_FIELDS.isdisjoint(document):
         return None
     found = {name: document[name] for name in EPISODE_FIELDS if document.get(name) is not None}
@@ -150,12 +149,12 @@ def parse_integer(document: Mapping[str, Any], name: str) -> int | None:
 def parse_finite(
     document: Mapping[str, Any], name: str, expected: str, *, kinds: tuple[type, ...] = (int, float)
 ) -> float | None:
-    """Return an optional field as a float. Raises RequestError when it is something else, or no float can hold it."""
+    """Return an optional field as a float. Raises RequestError if it is anything else, or too large for a float."""
     value = document.get(name)
     if value is None:
         return None
     if type(value) in kinds:
-        with contextlib.suppress(OverflowError):  # JSON's integers have no end
+        with contextlib.suppress(OverflowError):  # JSON's integers are unbounded
             number = float(value)
             if math.isfinite(number):
                 return number
@@ -176,11 +175,11 @@ def _check_fields(document: dict[str, Any]) -> None:
 
 
 def _plain(action: Any) -> Any:
-    """Return an action, or a state, for orjson, which takes no 0-d arrays."""
+    """Return an action or a state in a form for orjson, which rejects 0-d arrays."""
     if isinstance(action, dict):
         return {key: _plain(part) for key, part in action.items()}
     if isinstance(action, tuple):
         return [_plain(part) for part in action]
-    if isinstance(action, str):  # what a state belongs to
+    if isinstance(action, str):  # the policy that a state belongs to
         return action
     return action if action.ndim else action.item()

@@ -1,4 +1,4 @@
-"""JSON text: parsed with sentences that name what a robot's programmer got wrong, and written."""
+"""JSON text: parsed with errors that name the mistake in the client's code, and written."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ def parse_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[d
 
 
 def json_type(value: Any) -> str:
-    """Say what a JSON value is, for an error's sentence."""
+    """Return a JSON value's type, for an error message."""
     if value is None:
         return "null"
     if isinstance(value, bool):
         return str(value).lower()
     names: dict[type, str] = {str: "a string", list: "a list", dict: "an object"}
-    if type(value) not in (int, float, *names):  # msgpack brings other things than JSON
+    if type(value) not in (int, float, *names):  # msgpack has other types besides JSON's
         return f"a {type(value).__name__}"
     return names.get(type(value)) or f"the number {value!r:.40}"
 
 
 def encode_json(document: Mapping[str, Any] | list[Any]) -> bytes:
-    """Return any small document's JSON; text that UTF-8 cannot hold is escaped rather than refused."""
+    """Return a small document's JSON; text that UTF-8 cannot encode is escaped rather than refused."""
     try:
         return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
     except TypeError:
@@ -53,8 +53,8 @@ def encode_json(document: Mapping[str, Any] | list[Any]) -> bytes:
 def _parse_lenient(body: bytes, error: orjson.JSONDecodeError, such_as: str) -> Any:
     """Parse NaN, Infinity and numbers too large for a double, which Python's own parser takes.
 
-    A policy's client that sends them has a broken sensor or a division by zero; "invalid JSON" would not help it. What
-    else Python's parser takes (half a surrogate pair) is not JSON.
+    A client that sends them has a broken sensor or a division by zero; "invalid JSON" would not help it. Anything else
+    that Python's parser accepts (half a surrogate pair) is not JSON.
     """
     non_finite = False
 

@@ -1,7 +1,7 @@
 """MessagePack as openpi's policy server speaks it: frame to `Request`, decision to a frame.
 
 A request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
-What openpi's clients send in addition to observations (`prompt`) is ignored, unless it is an element's name.
+Further fields of openpi's clients (`prompt`) are ignored, unless an element has that name.
 `actions` in the reply is a chunk of one action, `(1, ...)`, as openpi's clients expect; a batch of observations gets
 one chunk each.
 """
@@ -23,7 +23,7 @@ from rlservo.serve_app.wire.asgi import Message
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 IGNORED = frozenset({"prompt", "env_id"})
-"""Fields that openpi's clients send for other policies (task, robot); without effect here."""
+"""Fields that openpi's clients send for other policies (task, robot); ignored here."""
 
 
 class MsgpackCodec:
@@ -34,10 +34,10 @@ class MsgpackCodec:
         self._max_bytes = handler.settings.max_body_bytes
 
     async def receive(self, request: Request, source: Message) -> Mapping[Any, Any]:
-        """Return the map in a frame; its `seq` is known from then on, for an error's frame. Raises RequestError."""
+        """Return the map in a frame, and note its `seq` for an error's frame. Raises RequestError."""
         content = source.get("bytes")
         if content is None:
-            raise RequestError("the message is a text frame: send msgpack in a binary one")
+            raise RequestError("the message is a text frame: send msgpack in a binary frame")
         if len(content) > self._max_bytes:
             raise TooLargeError(f"the message is larger than {self._max_bytes} bytes", {"max_bytes": self._max_bytes})
         document = unpack(content, most=self._most_values(request, content) if len(content) > SMALL else None)
@@ -79,7 +79,7 @@ class MsgpackCodec:
         return max(bounds.values for bounds in check_length(store, request.policy, content, max_batch))
 
     def _names(self, request: Request, name: str) -> bool:
-        """Whether an observation of the request's policy has a part or an element of that name."""
+        """Return whether an observation of the request's policy has a part or an element of that name."""
         stream = request.stream
         policy = self._handler.store().get(request.policy, request.version) if stream is None else stream.policy
         space = policy.contract.observation_space
@@ -89,14 +89,14 @@ class MsgpackCodec:
 
 
 def encode_metadata(contract: Contract) -> bytes:
-    """Return the frame that a client gets on connecting: who decides, and the whole contract."""
+    """Return the frame that a client gets on connecting: the policy's name and version, and the whole contract."""
     return pack(
         {
             "server": "rlservo",
             "policy": contract.name,
             "version": contract.version,
             "control_rate_hz": contract.control_rate_hz,
-            "action_horizon": 1,  # steps in a chunk, as `actions` of a reply are
+            "action_horizon": 1,  # steps in a chunk, as in a reply's `actions`
             "contract": contract.model_dump(mode="json"),
         }
     )

@@ -1,8 +1,8 @@
 """Open Inference Protocol over gRPC: the methods of `GRPCInferenceService`, called by an engine's gRPC server.
 
-The same policies, options and errors as over HTTP (`oip_infer.py`); an error's HTTP status becomes the gRPC status
-here, its code goes into the trailing metadata. Messages are `oip_messages.py`'s; tensors come raw or typed and go as
-they came.
+The same policies, options and errors as over HTTP (`oip_infer.py`); an error's HTTP status becomes a gRPC status, its
+code goes into the trailing metadata. The messages are in `oip_messages.py`; a reply's tensors are raw or typed as the
+request's were.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 Incoming = tuple[bytes, float | None]
-"""A request's bytes, and how many seconds its caller still waits for the answer (None: indefinitely)."""
+"""A request's bytes, and the seconds for which its caller still waits (None: indefinitely)."""
 
 logger = logging.getLogger(__name__)
 
@@ -63,14 +63,14 @@ CODES = {
     408: grpc.StatusCode.DEADLINE_EXCEEDED,
     409: grpc.StatusCode.FAILED_PRECONDITION,
     410: grpc.StatusCode.FAILED_PRECONDITION,
-    413: grpc.StatusCode.RESOURCE_EXHAUSTED,  # what gRPC itself says of a message beyond its limit
+    413: grpc.StatusCode.RESOURCE_EXHAUSTED,  # gRPC's own status for a message beyond its limit
     415: grpc.StatusCode.INVALID_ARGUMENT,
     422: grpc.StatusCode.INVALID_ARGUMENT,
     429: grpc.StatusCode.RESOURCE_EXHAUSTED,
     503: grpc.StatusCode.UNAVAILABLE,
 }
-OPEN = frozenset({"ServerLive", "ServerReady"})  # what orchestrators probe; every other method wants the keys' `act`
-# The field of InferTensorContents that holds a datatype; FP16 has none and comes raw.
+OPEN = frozenset({"ServerLive", "ServerReady"})  # probed by orchestrators; every other method needs a key's role `act`
+# The field of InferTensorContents that holds a datatype; FP16 has none and is sent raw.
 FIELDS = {
     "BOOL": "bool_contents",
     **dict.fromkeys(("INT8", "INT16", "INT32"), "int_contents"),
@@ -92,16 +92,16 @@ FIELD_DTYPES = {
 
 
 class Grpc:
-    """Answers gRPC calls from the handler."""
+    """Answers gRPC calls with the handler."""
 
     def __init__(self, handler: RequestHandler, *, local_only: bool = False) -> None:
-        """Take the handler. `local_only`: Serve binds its gRPC ports to every interface, whatever host it is given."""
+        """Take the handler. `local_only`: Serve binds its gRPC ports to every interface, whatever its host option."""
         self._handler = handler
         self._codec = OipGrpcCodec(handler)
         self._local_only = local_only
 
     async def answer(self, method: str, incoming: Incoming, context: Any) -> Any:
-        """Return the reply to one call. An error sets the status, and the empty reply is not looked at."""
+        """Return the reply to one call. An error sets the status, and the empty reply is ignored."""
         try:
             request = self._begin(method, context)
             if request.request_id is not None:
@@ -116,7 +116,7 @@ class Grpc:
     async def stream(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[Any]:
         """Yield a reply to each request of a stream; an error is also a reply, and the stream continues.
 
-        A stream that says nothing for `stream_idle_s` is ended.
+        A stream that is silent for `stream_idle_s` is closed.
         """
         handler = self._handler
         idle_s = handler.settings.stream_idle_s
@@ -162,9 +162,7 @@ class Grpc:
     def _begin(self, method: str, context: Any) -> Request:
         """Return a call's request, whose content is still to be read. Raises ForbiddenError, UnauthenticatedError."""
         if self._local_only and not is_local(context.peer()):
-            raise ForbiddenError(
-                "this server listens on this machine only: serve it with --host to reach it from others"
-            )
+            raise ForbiddenError("this server accepts only clients on its own machine: serve it with --host for others")
         metadata = context.invocation_metadata()
         headers: dict[bytes, bytes] = {}
         texts: dict[str, str] = {}
@@ -308,18 +306,18 @@ def _set(parameter: Any, value: Any) -> None:
 
 
 def _inputs(message: Any) -> dict[str, NDArray[Any]]:
-    """Return the inputs by name. Raises RequestError if the form is wrong, ObservationError where numbers are."""
+    """Return the inputs by name. Raises RequestError if the form is wrong, ObservationError if numbers are."""
     raw = message.raw_input_contents
     if not message.inputs:
         raise RequestError("'inputs' must hold at least one tensor, with name, datatype and shape")
     if raw and len(raw) != len(message.inputs):
         raise RequestError(
-            f"there are {len(message.inputs)} inputs and {len(raw)} raw_input_contents: one for each, or none"
+            f"there are {len(message.inputs)} inputs and {len(raw)} raw_input_contents: expected one for each, or none"
         )
     seen: set[str] = set()
     for tensor in message.inputs:
         if tensor.name in seen:
-            raise RequestError(f"input '{tensor.name[:64]}' is there twice")
+            raise RequestError(f"input '{tensor.name[:64]}' is given twice")
         seen.add(tensor.name)
     inputs: dict[str, NDArray[Any]] = {}
     for index, tensor in enumerate(message.inputs):
@@ -341,11 +339,11 @@ def _typed(label: str, tensor: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
         raise RequestError(f"input '{label}': datatype {tensor.datatype} has no typed contents: use raw_input_contents")
     others = [given.name for given, _ in tensor.contents.ListFields() if given.name != field]
     if others:
-        raise RequestError(f"input '{label}' of datatype {tensor.datatype} belongs into '{field}', not '{others[0]}'")
+        raise RequestError(f"input '{label}' of datatype {tensor.datatype} belongs in '{field}', not '{others[0]}'")
     values = getattr(tensor.contents, field)
     if len(values) != math.prod(shape):
         raise ObservationError(
-            f"input '{label}': '{field}' has {len(values)} numbers, not the {math.prod(shape)} of shape {list(shape)}",
+            f"input '{label}': '{field}' has {len(values)} values, expected {math.prod(shape)} for shape {list(shape)}",
             {"expected_shape": list(shape), "numbers": len(values)},
         )
     array = np.array(values, FIELD_DTYPES[field])
@@ -353,7 +351,7 @@ def _typed(label: str, tensor: Any, shape: tuple[int, ...], dtype: np.dtype[Any]
 
 
 def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters as plain values; one without a value is left out."""
+    """Return parameters as plain values, without those that have none."""
     plain = {}
     for name, value in given.items():
         choice = value.WhichOneof("parameter_choice")
@@ -366,11 +364,11 @@ def _parse(kind: Any, content: bytes) -> Any:
     try:
         return kind.FromString(content)
     except DecodeError as error:
-        raise RequestError(f"the message is no {kind.DESCRIPTOR.name}: {error}") from None
+        raise RequestError(f"the message is not a {kind.DESCRIPTOR.name}: {error}") from None
 
 
 def _id_of(content: bytes) -> str:
-    """Return the id of a request that failed, if it can be read at all."""
+    """Return the id of a request that failed, if it can be read."""
     try:
         return str(messages.ModelInferRequest.FromString(content).id)
     except DecodeError:
@@ -385,7 +383,7 @@ def _error_reply(error: RlservoError, content: bytes) -> Any:
 
 
 def _fail(context: Any, error: Exception) -> None:
-    """Set the status of a call. Serve would log what is raised, with a traceback: too much for a client's fault."""
+    """Set the status of a call. Serve would log an exception with its traceback, too much for a client's fault."""
     status, sentence, code = _explain(error)
     context.set_code(status)
     context.set_details(sentence)
@@ -397,11 +395,11 @@ def _fail(context: Any, error: Exception) -> None:
 
 
 def _explain(error: Exception) -> tuple[grpc.StatusCode, str, str]:
-    """Return (status, sentence, code) of an error; the inside of the server stays inside."""
+    """Return (status, sentence, code) of an error, without internal details."""
     if not isinstance(error, RlservoError):
         logger.error("a gRPC call failed", exc_info=error)
         return grpc.StatusCode.INTERNAL, BUG, InternalError.code
-    if isinstance(error, InternalError):  # which is logged already
+    if isinstance(error, InternalError):  # already logged
         return grpc.StatusCode.INTERNAL, BUG, error.code
     status = CODES.get(status_of(error), grpc.StatusCode.INTERNAL)
     if status is grpc.StatusCode.INTERNAL:

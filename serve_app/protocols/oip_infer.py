@@ -1,10 +1,10 @@
-"""Open Inference Protocol v2 over HTTP: inference, with binary tensors, as Triton's clients speak it.
+"""Open Inference Protocol v2 over HTTP: inference with binary tensors, as in Triton's clients.
 
 A policy is a model with the contract's inputs (`obs`, or `obs.<path>` for each leaf of a nested space,
-`state_in.<name>` and `reward`; `last_action` or `last_action.<path>`, where its step is limited) and outputs (`action`
-or `action.<path>`, `state_out.<name>`); every call is for a batch, as the protocol's shapes say. The request parameters
-`explore`, `seed`, `seq`, `deadline_ms` and `timestamp` mean what they mean in the JSON protocol; `sequence_id`,
-`sequence_start` and `sequence_end` are its sessions, and `state_policy`, which the reply gives with the states, is
+`state_in.<name>` and `reward`; `last_action` or `last_action.<path>`, if its step is limited) and outputs (`action`
+or `action.<path>`, `state_out.<name>`); every call is for a batch, as the protocol's shapes imply. The request
+parameters `explore`, `seed`, `seq`, `deadline_ms` and `timestamp` are those of the JSON protocol; `sequence_id`,
+`sequence_start` and `sequence_end` are its sessions, and `state_policy`, which the reply returns with the states, is
 its `@policy`.
 
 Specification: github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
@@ -48,19 +48,19 @@ from rlservo.serve_app.wire.request_names import BELONGS_TO
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
 BINARY = b"application/octet-stream"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
-LAST_ACTION = "last_action"  # inputs like the outputs `action` and `action.<path>`
-STATE_POLICY = "state_policy"  # whose the states are
+LAST_ACTION = "last_action"  # inputs named like the outputs `action` and `action.<path>`
+STATE_POLICY = "state_policy"  # identity of the policy that the states belong to
 REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
-MODEL_NAME = "model_name"  # KServe's client says again what the path says
-# Parameters of the protocol and its clients besides our own options. A priority has no effect: nothing queues.
+MODEL_NAME = "model_name"  # KServe's client repeats the path's name here
+# Parameters of the protocol and its clients besides our own options. Priority has no effect: there is no queue.
 OUTCOME = ("reward", "final_status", "truncated")  # parameters with the meaning that they have in JSON
 PARAMETERS = frozenset(
     {*OPTIONS, *OUTCOME, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY}
 )
 TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
 IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
-SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits one packet either way
-COMPRESSION_LEVEL = 1  # numbers of a robot hardly compress; a control loop waits for them
+SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits into one packet anyway
+COMPRESSION_LEVEL = 1  # a robot's numbers hardly compress, and a control loop waits for them
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
 
 
@@ -76,9 +76,9 @@ class ReplyOptions:
 
     contract: Contract
     binary: bool
-    """Whether outputs are to be bytes, of which the request does not say otherwise."""
+    """Whether outputs are bytes unless the request specifies each."""
     outputs: dict[str, bool]
-    """The outputs that were asked for, in order, and whether as bytes; none asked for means all."""
+    """The requested outputs, in order, and whether as bytes; empty means all."""
     request_id: str | None = None
     """The protocol's own `id`, echoed."""
 
@@ -90,15 +90,15 @@ class OipHttpCodec:
         self._handler = handler
 
     async def receive(self, request: Request, source: Receive) -> Body:
-        """Return the body, compressed as it came. Raises MediaTypeError, and what `receive_body` raises.
+        """Return the body, still compressed. Raises MediaTypeError, and what `receive_body` raises.
 
-        Triton's client names no content type, others name JSON or octets: the length header distinguishes them.
+        Triton's client sends no content type, others send JSON or octets: the length header distinguishes them.
         """
         check_media_type(request.headers, JSON, BINARY, optional=True)
         encoding = request.headers.get(b"content-encoding", b"")
         if encoding.strip().lower() not in (b"identity", b"gzip", b"deflate", b""):
             raise MediaTypeError(
-                f"the content encoding '{encoding[:32].decode('latin-1')}' is not read: send gzip, deflate or none"
+                f"the content encoding '{encoding[:32].decode('latin-1')}' is not supported: send gzip, deflate or none"
             )
         return await receive_body(self._handler, request.headers, source)
 
@@ -148,8 +148,7 @@ def fill_request(
 ) -> None:
     """Fill a request of either transport, whose `parameters` and `outputs` are in `document`.
 
-    A deadline that the request has already is the transport's own: the earlier one holds. Raises RequestError and
-    ObservationError.
+    A deadline already set is the transport's own: the earlier one counts. Raises RequestError and ObservationError.
     """
     parameters = document.get("parameters") or {}
     if parameters:
@@ -157,9 +156,9 @@ def fill_request(
     sequence = parameters.get("sequence_id")
     identity = parameters.get(STATE_POLICY)
     if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
-        identity = None  # there is no state that it could be of
+        identity = None  # there is no state that it could belong to
     session_id = _session_id(sequence) if sequence else None
-    # Of the session, or of the state of that identity, whatever the default is meanwhile.
+    # The policy of the session, or of the state with that identity, even if the default has changed.
     policy = handler.episodes.policy_of(handler.store(), request.policy, request.version, session_id, identity)
     contract = policy.contract
     binary = bool(parse_flag(parameters, "binary_data_output")) if parameters else False
@@ -177,8 +176,8 @@ class Answer:
     name: str
     version: str
     parameters: dict[str, Any]
-    outputs: dict[str, NDArray[Any]]  # in the order they were asked for
-    binary: dict[str, bool]  # the same names: as bytes, or in the JSON
+    outputs: dict[str, NDArray[Any]]  # in the requested order
+    binary: dict[str, bool]  # by the same names: bytes or JSON
 
 
 def answer_of(request: Request, decision: Decision) -> Answer:
@@ -198,7 +197,7 @@ def answer_of(request: Request, decision: Decision) -> Answer:
 
 
 def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
-    """Return everything the model can answer with, by tensor name."""
+    """Return all outputs of the model, by tensor name."""
     outputs: dict[str, NDArray[Any]] = action_leaves(contract.action_space, decision.action)
     if decision.episode is not None and decision.episode.state is not None:
         carried = decision.episode.state
@@ -211,11 +210,11 @@ def _parse_document(
 ) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
     """Return (the JSON document, the inputs by name, whether the JSON held NaN)."""
     if length is not None and length > len(view):
-        raise RequestError(f"Inference-Header-Content-Length is {length}, and the body has {len(view)} bytes")
+        raise RequestError(f"Inference-Header-Content-Length is {length}, but the body has {len(view)} bytes")
     header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
     document, non_finite = parse_json(header, such_as=SUCH_AS)
     if document.pop(MODEL_NAME, None) not in (None, model):
-        raise RequestError(f"'{MODEL_NAME}' is not '{model[:64]}', which the path names")
+        raise RequestError(f"'{MODEL_NAME}' differs from '{model[:64]}', which the path names")
     unknown = next((field for field in document if field not in REQUEST_FIELDS), None)
     if unknown is not None:
         raise RequestError(f"unknown field '{unknown[:64]}': expected one of {', '.join(sorted(REQUEST_FIELDS))}")
@@ -231,7 +230,7 @@ def _parse_document(
     for tensor in tensors:
         name, array, offset = parse_tensor(tensor, raw, offset)
         if name in inputs:
-            raise RequestError(f"input '{name[:64]}' is there twice")
+            raise RequestError(f"input '{name[:64]}' is given twice")
         inputs[name] = array
     if offset != len(raw):
         raise RequestError(f"the body has {len(raw) - offset} bytes after the last tensor's data")
@@ -239,16 +238,16 @@ def _parse_document(
 
 
 def _raw_input(contract: Contract, view: memoryview) -> NDArray[Any]:
-    """Read a body without any JSON: the one input's bytes; the batch is whatever they amount to."""
+    """Read a body without JSON: the only input's bytes; their number gives the batch size."""
     if len(contract.inputs) != 1:
         names = ", ".join(tensor.name for tensor in contract.inputs)
-        raise RequestError(f"a body without JSON is for models of one input; this one has {names}")
+        raise RequestError(f"a body without JSON is for models with one input; this one has {names}")
     tensor = contract.inputs[0]
     dtype = DTYPES[datatype_of(tensor.dtype)]
     row = dtype.itemsize * int(np.prod(tensor.shape[1:]))
     if len(view) % row:
         raise ObservationError(
-            f"input '{tensor.name}' is of {row} bytes per observation, and the body has {len(view)}: not a multiple"
+            f"input '{tensor.name}' takes {row} bytes per observation, but the body has {len(view)}: not a multiple"
         )
     return from_bytes(tensor.name, view, (len(view) // row, *tensor.shape[1:]), dtype)
 
@@ -258,20 +257,18 @@ def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
     listed: Sequence[TensorSpec] = contract.inputs
     known = [tensor.name for tensor in listed]
     unknown = next((name for name in inputs if name not in known), None)
-    if unknown is not None:  # a last action, which is an input without standing in the contract, or a mistake
+    if unknown is not None:  # a last action, which is an input that the contract does not list, or a mistake
         listed = [*listed, *last_action_inputs(contract)]
         unknown = next((name for name in inputs if all(name != tensor.name for tensor in listed)), None)
     if unknown is not None:
-        raise ObservationError(
-            f"policy '{contract.name}' has the input {quoted(known)} and has no input '{unknown[:64]}'"
-        )
+        raise ObservationError(f"policy '{contract.name}' has no input '{unknown[:64]}': expected {quoted(known)}")
     rows: dict[str, int] = {}
     for expected in listed:
         array = inputs.get(expected.name)
         if array is None:
             if expected.name == REWARD or expected.name.startswith((STATE_IN, LAST_ACTION)):
                 continue
-            raise ObservationError(f"policy '{contract.name}' has the input '{expected.name}' and did not get it")
+            raise ObservationError(f"policy '{contract.name}' needs the input '{expected.name}', which is missing")
         if array.shape[1:] != expected.shape[1:] or array.ndim != len(expected.shape):
             raise ObservationError(
                 f"policy '{contract.name}' expects input '{expected.name}' of shape {list(expected.shape)} "
@@ -281,19 +278,19 @@ def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
         rows[expected.name] = len(array)
     if len(set(rows.values())) > 1:
         batches = ", ".join(f"{name} {count}" for name, count in rows.items())
-        raise ObservationError(f"the inputs of policy '{contract.name}' are not of one batch: {batches}")
+        raise ObservationError(f"the inputs of policy '{contract.name}' have different batch sizes: {batches}")
     return build_action(contract.observation_space, inputs, "obs")
 
 
 def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Episode | None:
-    """Return what the inputs and parameters say of the episode. Raises RequestError."""
+    """Return the episode fields of the inputs and parameters. Raises RequestError."""
     states: dict[str, Any] = {
         name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
     }
     belongs_to = parameters.get(STATE_POLICY)
     if states and belongs_to is not None:
         if type(belongs_to) is not str:
-            raise RequestError(f"'{STATE_POLICY}' must be the string that the last reply gave")
+            raise RequestError(f"'{STATE_POLICY}' must be the string from the last reply")
         states[BELONGS_TO] = belongs_to
     outcome = parse_episode({name: parameters[name] for name in OUTCOME if name in parameters}) or Episode()
     reward = inputs.get(REWARD, outcome.reward)
@@ -304,7 +301,7 @@ def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters:
     start, end = bool(parse_flag(parameters, "sequence_start")), bool(parse_flag(parameters, "sequence_end"))
     sequence_id = parameters.get("sequence_id")
     if sequence_id in (None, 0, ""):
-        if start and not states:  # a single step, for a client that carries the state from there
+        if start and not states:  # a single step, for a client that carries the state afterwards
             return Episode(state={}, **common)
         if not states and all(value is None or value is False for value in common.values()):
             return None
@@ -319,7 +316,7 @@ def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters:
 
 
 def _session_id(sequence_id: Any) -> SessionId:
-    """Return a sequence's id as a session's; an integer and a string of its digits are two. Raises RequestError."""
+    """Return a sequence's id as a session's; an integer and a string of its digits differ. Raises RequestError."""
     if type(sequence_id) in (int, str) and len(str(sequence_id)) < LONGEST_SESSION_ID:
         return sequence_id  # type: ignore[no-any-return]  # mypy does not narrow by the type's own identity
     raise RequestError("'sequence_id' must be an integer, or a string of fewer than 128 characters")
@@ -332,12 +329,12 @@ def _last_action(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
         return None
     missing = next((tensor.name for tensor in last_action_inputs(contract) if tensor.name not in given), None)
     if missing is not None:
-        raise ObservationError(f"policy '{contract.name}' did not get the input '{missing}', but others of last_action")
+        raise ObservationError(f"policy '{contract.name}' needs '{missing}' too if other last_action inputs are sent")
     return build_action(contract.action_space, given, LAST_ACTION)
 
 
 def last_action_inputs(contract: Contract) -> list[TensorSpec]:
-    """Return what the inputs of a last action look like: as the outputs that gave it."""
+    """Return the inputs for a last action, with the form of the outputs that gave it."""
     return [
         tensor.model_copy(update={"name": LAST_ACTION + tensor.name.removeprefix("action")})
         for tensor in contract.outputs
@@ -346,7 +343,7 @@ def last_action_inputs(contract: Contract) -> list[TensorSpec]:
 
 
 def _fill_options(request: Request, parameters: Mapping[str, Any]) -> None:
-    """Set the request's options; refuse what would otherwise be ignored in silence."""
+    """Set the request's options; refuse any that would otherwise be ignored silently."""
     for name in parameters:
         if name not in PARAMETERS and name not in IGNORED:
             raise RequestError(
@@ -366,7 +363,7 @@ def _fill_options(request: Request, parameters: Mapping[str, Any]) -> None:
 def _wanted_outputs(
     contract: Contract, document: Mapping[str, Any], parameters: Mapping[str, Any], *, binary: bool
 ) -> dict[str, bool]:
-    """Return the outputs that were asked for, and whether as bytes; none asked for means all.
+    """Return the requested outputs, and whether as bytes; an empty result means all.
 
     Raises RequestError for outputs that do not exist.
     """
@@ -382,27 +379,27 @@ def _wanted_outputs(
         if type(name) is not str or name not in known:
             given = json_type(output.get("name") if type(output) is dict else output)
             shown = f" '{name[:64]}'" if type(name) is str else f" {given}"
-            raise RequestError(f"an output{shown} does not exist: the model's output is {quoted(known)}")
+            raise RequestError(f"the output{shown} does not exist: expected {quoted(known)}")
         if name.startswith(STATE_OUT) and parameters.get("sequence_id"):
-            raise RequestError(f"the output '{name}' stays with the sequence: ask for the action, or carry the state")
+            raise RequestError(f"the output '{name}' is kept with the sequence: request the action, or carry the state")
         own = output.get("parameters") or {}
         if type(own) is not dict:
             raise RequestError(f"an output's 'parameters' must be an object, got {json_type(own)}")
         refused = next((name for name in ("classification", "shared_memory_region") if name in own), None)
         if refused is not None:
-            raise RequestError(f"the output parameter '{refused}' is not offered: leave it out")
+            raise RequestError(f"the output parameter '{refused}' is not supported: leave it out")
         chosen = parse_flag(own, "binary_data")
         wanted[name] = binary if chosen is None else chosen
     return wanted
 
 
 def offered_inputs(policy: Policy) -> list[TensorSpec]:
-    """Return the inputs this protocol offers: the contract's, and the last action where the step is limited."""
+    """Return the inputs that this protocol offers: the contract's, and the last action if the step is limited."""
     return [*policy.contract.inputs, *(last_action_inputs(policy.contract) if policy.has_step_limit else ())]
 
 
 def offered_outputs(contract: Contract) -> list[TensorSpec]:
-    """Return the outputs this protocol offers: actions and states, not the network's inner values."""
+    """Return the outputs that this protocol offers: actions and states, not the network's internal values."""
     return [
         tensor
         for tensor in contract.outputs
@@ -418,18 +415,18 @@ def _parse_length(value: bytes | None) -> int | None:
         return None
     if not value.isdigit() or len(value) > 15:
         raise RequestError(
-            f"Inference-Header-Content-Length must be the JSON's length, got '{value[:32].decode('latin-1')}'"
+            f"Inference-Header-Content-Length must be the length of the JSON, got '{value[:32].decode('latin-1')}'"
         )
     return int(value)
 
 
 def _decompress(body: Body, encoding: bytes, limit: int) -> bytes:
-    """Undo gzip or deflate, to `limit` bytes at most: a few kilobytes can unpack to gigabytes."""
+    """Decompress gzip or deflate to at most `limit` bytes: a few kilobytes can unpack to gigabytes."""
     try:
         stream = zlib.decompressobj(zlib.MAX_WBITS | (16 if encoding == b"gzip" else 0))
         plain = stream.decompress(body, limit + 1)
     except zlib.error as error:
-        raise RequestError(f"the body is not {encoding.decode()}: {error}") from None
+        raise RequestError(f"the body is not valid {encoding.decode()}: {error}") from None
     if len(plain) > limit:
         raise too_large(limit)
     if not stream.eof or stream.unused_data:
@@ -439,7 +436,7 @@ def _decompress(body: Body, encoding: bytes, limit: int) -> bytes:
 
 
 def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes, Headers]:
-    """Compress for a client that asked for it with accept-encoding."""
+    """Compress for a client that sent accept-encoding."""
     offered = {part.split(b";")[0].strip() for part in accepted.split(b",") if b"q=0" not in part.replace(b"q=0.", b"")}
     for encoding, bits in ((b"gzip", zlib.MAX_WBITS | 16), (b"deflate", zlib.MAX_WBITS)):
         if encoding in offered:

@@ -75,8 +75,8 @@ _MESSAGES: dict[str, list[str]] = {
     "RepositoryIndexRequest": ["string repository_name", "bool ready"],
     "RepositoryIndexResponse": ["repeated RepositoryIndexResponse.ModelIndex models"],
     "RepositoryIndexResponse.ModelIndex": ["string name", "string version", "string state", "string reason"],
-    # Of Triton's configuration and statistics only what is told here (`oip_models.py`). On the wire an enumeration is
-    # an int32: DATA_TYPES has its names.
+    # Triton's configuration and statistics, reduced to the fields filled here (`oip_models.py`). On the wire an
+    # enumeration is an int32: DATA_TYPES has its names.
     "ModelConfigRequest": ["string name", "string version"],
     "ModelConfigResponse": ["ModelConfig config"],
     "ModelConfig": [
@@ -144,4 +144,4 @@ _METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
 messages: Any = SimpleNamespace(
     **build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice", services={"GRPCInferenceService": _METHODS})
 )
-"""The classes by name; those made at run time have no static type. A nested one is an attribute of its outer one's."""
+"""The classes by name; made at run time, they have no static type. A nested class is an attribute of its outer one."""

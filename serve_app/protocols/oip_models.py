@@ -1,8 +1,8 @@
 """Open Inference Protocol v2: health, metadata, configuration and statistics of models, and the repository index.
 
 Triton's tools (perf_analyzer, model_analyzer) ask for configuration and statistics before they infer. These documents
-have the fields of Triton's messages ModelConfig and ModelStatistics. A field of theirs that nothing here corresponds to
-is left out, a duration that is not measured is 0. gRPC's messages have the same fields.
+have the fields of Triton's messages ModelConfig and ModelStatistics. Fields without a counterpart here are left out,
+durations that are not measured are 0. gRPC's messages have the same fields.
 
 Specification: github.com/triton-inference-server/server, docs/protocol/extension_model_configuration.md and
 extension_statistics.md; github.com/triton-inference-server/common, protobuf/model_config.proto.
@@ -86,15 +86,15 @@ def routes(handler: RequestHandler) -> list[Route]:
 
     models = "/v2/models"
     return [
-        Route(GET, "/v2/health/live", Access.open, "The process answers", live),
+        Route(GET, "/v2/health/live", Access.open, "The process is alive", live),
         Route(GET, "/v2/health/ready", Access.open, "The policies are loaded and proven", ready),
-        Route(GET, "/v2", Access.act, "The server and the extensions it speaks", server),
+        Route(GET, "/v2", Access.act, "The server and its extensions", server),
         Route(GET, f"{models}/stats", Access.act, "Statistics of every model", stats),  # before a model of that name
         *of_policy(GET, models, "", "Metadata of a model", answer=metadata),
         *of_policy(GET, models, "/ready", "The model is loaded and proven", answer=model_ready),
         *of_policy(GET, models, "/stats", "Statistics of a model", answer=stats),
         *of_policy(GET, models, "/config", "Configuration of a model", answer=config),
-        Route(POST, "/v2/repository/index", Access.act, "Every version of every model", index),
+        Route(POST, "/v2/repository/index", Access.act, "All versions of all models", index),
     ]
 
 
@@ -107,12 +107,12 @@ def _json(document: Any) -> tuple[bytes, Headers]:
 
 
 def server_metadata() -> dict[str, Any]:
-    """Return who this is, and the extensions it speaks."""
+    """Return the server's name, version and extensions."""
     return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
 
 
 def repository_index(handler: RequestHandler, *, ready: bool = False) -> list[dict[str, str]]:
-    """Return every version of every model and how it stands; `ready` leaves the others out."""
+    """Return every version of every model with its state; `ready` leaves the others out."""
     handler.store()
     return [
         {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
@@ -141,7 +141,7 @@ def model_metadata(handler: RequestHandler, name: str, version: str | None) -> d
 
 
 def model_config(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
-    """Return how a model is run, as ModelConfig; `version` None is the default.
+    """Return a model's configuration, as ModelConfig; `version` None is the default.
 
     Raises UnknownPolicyError, UnknownVersionError, UnavailableError.
     """
@@ -164,12 +164,12 @@ def model_config(handler: RequestHandler, name: str, version: str | None) -> dic
 def _input(tensor: TensorSpec) -> dict[str, Any]:
     described = _tensor(tensor)
     if tensor.name == REWARD or tensor.name.startswith((STATE_IN, LAST_ACTION)):
-        described["optional"] = True  # an episode begins without
+        described["optional"] = True  # absent at an episode's start
     return described
 
 
 def _tensor(tensor: TensorSpec) -> dict[str, Any]:
-    """Return a tensor as Triton's configuration has it: without the axis of the batch."""
+    """Return a tensor in the form of Triton's configuration: without the batch axis."""
     return {"name": tensor.name, "data_type": f"TYPE_{datatype_of(tensor.dtype)}", "dims": list(tensor.shape[1:])}
 
 
@@ -189,13 +189,13 @@ def _sequences(handler: RequestHandler, policy: Policy) -> dict[str, Any]:
 
 
 def statistics(handler: RequestHandler, name: str | None = None, version: str | None = None) -> list[dict[str, Any]]:
-    """Return what this replica has counted of each version since its start, as ModelStatistics.
+    """Return this replica's counts for each version since its start, as ModelStatistics.
 
-    Without a `version` of every version of the model, without a `name` of every model. All protocols count.
+    Without a `version`, all versions of the model; without a `name`, all models. All protocols count.
     Raises UnknownPolicyError, UnknownVersionError, UnavailableError, and RequestError for a version of no model.
     """
     if name is None and version is not None:
-        raise RequestError(f"the version '{version[:32]}' is of no model: name one")
+        raise RequestError(f"the version '{version[:32]}' needs a model: also give its name")
     store = handler.store()
     if name is None:
         wanted = [(each, known) for each in store.names for known in store.versions(each)]
@@ -218,9 +218,10 @@ def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
         "execution_count": totals.requests,
         "inference_stats": {
             "success": duration(totals.requests, totals.request_s),
-            "fail": duration(totals.failures, 0.0),  # how long they took is not kept
-            # What has been read is computed at once, and checking observation and action is in `compute_infer`: no time
-            # apart. The counts are equal all the same, perf_analyzer ends where they are not.
+            "fail": duration(totals.failures, 0.0),  # their durations are not kept
+            # A request is computed as soon as it is read, and `compute_infer` includes the checks of observation and
+            # action, which have no time of their own. The counts are equal all the same: perf_analyzer aborts if they
+            # differ.
             "queue": duration(totals.requests, 0.0),
             "compute_input": duration(totals.requests, 0.0),
             "compute_infer": duration(totals.requests, totals.inference_s),

@@ -38,14 +38,14 @@ TENSOR_FIELDS = frozenset({"name", "shape", "datatype", "parameters", "data"})
 
 
 def is_shape(shape: Sequence[Any]) -> bool:
-    """Whether numpy can make an array of this shape: even an empty one must not be too large in its other axes."""
+    """Return whether numpy can make an array of this shape: even an empty one is bounded in its other axes."""
     if len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
         return False
     return bool(math.prod(n for n in shape if n) < MOST_NUMBERS)
 
 
 def datatype_of(dtype: str | np.dtype[Any]) -> str:
-    """Return the protocol's name of a contract's or an array's dtype ('float32' is 'FP32')."""
+    """Return the protocol's name for a contract's or an array's dtype ('float32' is 'FP32')."""
     return NAMES[np.dtype(dtype).newbyteorder("=")]
 
 
@@ -78,7 +78,7 @@ def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDAr
     check_size(label, shape, dtype, size, "'binary_data_size' is")
     if offset + size > len(raw):
         raise RequestError(
-            f"input '{label}' needs {size} bytes after the JSON and {max(0, len(raw) - offset)} are left of the body"
+            f"input '{label}' needs {size} bytes after the JSON, but the body has {max(0, len(raw) - offset)} left"
         )
     return name, from_bytes(label, raw[offset : offset + size], tuple(shape), dtype), offset + size
 
@@ -88,7 +88,7 @@ def check_form(label: str, shape: Sequence[Any] | None, datatype: Any, parameter
     if shape is None or not is_shape(shape):
         raise RequestError(f"input '{label}': 'shape' must be a list of sizes such as [1, 27]")
     if datatype == "BYTES":
-        raise RequestError(f"input '{label}' is of datatype BYTES, which holds strings: a policy reads numbers")
+        raise RequestError(f"input '{label}' has datatype BYTES, which holds strings: send numbers")
     dtype = DTYPES.get(datatype) if type(datatype) is str else None
     if dtype is None:
         given = f"'{datatype[:64]}'" if type(datatype) is str else json_type(datatype)
@@ -99,7 +99,7 @@ def check_form(label: str, shape: Sequence[Any] | None, datatype: Any, parameter
 
 
 def check_size(label: str, shape: Sequence[int], dtype: np.dtype[Any], size: int, given: str) -> None:
-    """Raise RequestError unless a tensor's bytes are as many as its shape says; `given` is what said `size`."""
+    """Raise RequestError unless a tensor's bytes match its shape; `given` names the source of `size`."""
     expected = math.prod(shape) * dtype.itemsize
     if size != expected:
         raise RequestError(
@@ -109,14 +109,14 @@ def check_size(label: str, shape: Sequence[int], dtype: np.dtype[Any], size: int
 
 
 def from_bytes(label: str, raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the array that `raw` holds; its length has been checked. Not writable: it is the request's own memory.
+    """Return the array in `raw`, whose length has been checked. Not writable: it shares the request's memory.
 
     Raises ObservationError for a BOOL that is neither 0 nor 1.
     """
-    if dtype.kind == "b":  # numpy's own view of another byte is undefined
+    if dtype.kind == "b":  # in numpy any other byte is undefined
         return parse_array(np.frombuffer(raw, np.uint8), dtype, f"input '{label}'", ObservationError).reshape(shape)
     array: NDArray[Any] = np.frombuffer(raw, dtype)
-    if not array.flags.aligned:  # it begins wherever the JSON ended
+    if not array.flags.aligned:  # it may start at any offset, after the JSON
         array = array.copy()
     return array.reshape(shape)
 
@@ -128,7 +128,7 @@ def _from_json(label: str, data: Any, shape: tuple[int, ...], dtype: np.dtype[An
     array = parse_array(data, dtype, f"input '{label}': 'data'", ObservationError)
     if array.shape != shape and not (array.ndim == 1 and array.size == math.prod(shape)):
         raise ObservationError(
-            f"input '{label}': 'data' has the shape {list(array.shape)}, and 'shape' says {list(shape)}",
+            f"input '{label}': 'data' has the shape {list(array.shape)}, but 'shape' says {list(shape)}",
             {"expected_shape": list(shape), "shape": list(array.shape)},
         )
     if dtype.kind in "iu" and bool in _leaf_types(data):
@@ -142,7 +142,7 @@ def _leaf_types(data: list[Any]) -> set[type]:
 
 
 def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[str, Any], bytes]:
-    """Return the tensor's JSON and, in binary form, its bytes; `data` is the flat array, for orjson to write."""
+    """Return the tensor's JSON and, in binary form, its bytes; `data` is the flat array, which orjson writes."""
     document: dict[str, Any] = {
         "name": name,
         "datatype": datatype_of(array.dtype),

@@ -1,8 +1,8 @@
-"""OpenAPI document of the routing table, as FastAPI writes it, and the messages that it describes.
+"""OpenAPI document of the routing table, written by FastAPI, and the messages that it describes.
 
-FastAPI is imported when somebody asks for the document: it takes a third of a server's start. Requests are answered by
-the table itself and parsed by hand, in a microsecond where a pydantic model takes ten, with sentences that name what a
-robot's programmer got wrong.
+FastAPI is imported when a client requests the document: it takes a third of a server's start. Requests are answered by
+the table itself and parsed by hand, in a microsecond where a pydantic model takes ten, with errors that name the
+mistake in the client's code.
 """
 
 from __future__ import annotations
@@ -26,76 +26,74 @@ from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed
 from rlservo.serve_app.versions.serving_plan import Canary
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
-DESCRIPTION = "Actions from exported policies. Every error is a sentence, a code and, if it helps, details."
+DESCRIPTION = "Actions from exported policies. Every error has a sentence, a code and, where useful, details."
 ANY_ROUTE = (400, 401, 403, 408, 413, 429)  # its path, key, host, page, body and rate
 OF_POLICY = (404, 503)
 OF_COMMAND = (*OF_POLICY, 409, 415)
 OF_ACTION = (*OF_COMMAND, 410, 422, 500)
 OBS = (
-    "One observation or a batch (distinguished by shape): nested lists as the observation space is shaped, or, if the "
+    "One observation or a batch (distinguished by shape): nested lists in the observation space's shape or, if the "
     "contract names the elements, a map from each name to a number (a batch: to a list of numbers). Dict spaces are "
-    "maps, Tuple spaces lists of their parts."
+    "maps, Tuple spaces are lists of their parts."
 )
 
 
 class ActRequest(BaseModel):
-    """Ask for an action."""
+    """Request an action."""
 
     model_config = ConfigDict(extra="forbid")
 
     obs: Any = Field(description=OBS)
     explore: bool = Field(False, description="Sample the policy's action distribution instead of taking its mode.")
     seed: int | None = Field(None, ge=0, le=MAX_SEED, description="Makes an exploring action repeatable.")
-    seq: int | None = Field(None, description="Echoed in the reply, so that a late reply is not taken for a new one.")
+    seq: int | None = Field(None, description="Echoed in the reply, so that a late reply is recognised.")
     deadline_ms: float | None = Field(
-        None, description="Milliseconds left when the server receives the request. Work that would be late is not done."
+        None, description="Milliseconds left when the server receives the request. A late action is not computed."
     )
     timestamp: float | None = Field(
-        None, description="Your clock [s], echoed together with the server's when it received and answered."
+        None, description="Your clock [s], echoed together with the server's times of receipt and reply."
     )
     state: dict[str, Any] | None = Field(
-        None, description="A recurrent policy's memory: {} begins an episode, then what the last reply gave, unchanged."
+        None, description="A recurrent policy's memory: {} begins an episode; then the last reply's `state`, unchanged."
     )
     session_id: str | None = Field(
         None, min_length=1, max_length=LONGEST_SESSION_ID,
-        description="An id of your choice for requests that belong together; the server keeps a policy's memory by it.",
+        description="An id of your choice for requests that belong together; the policy's memory is kept under it.",
     )  # fmt: skip
     reset: bool = Field(False, description="Begin an episode: the first request of a recurrent policy's session.")
     end: bool = Field(False, description="Forget the session after this request.")
-    reward: Any = Field(None, description="What the last action brought: for policies that see it, and for recordings.")
+    reward: Any = Field(None, description="Reward of the last action: for policies that see it, and for recordings.")
     last_action: Any = Field(
-        None, description="What the robot was last commanded: where the action's step is limited, and for recordings."
+        None, description="The robot's last command: needed if the action's step is limited, and for recordings."
     )
     final_status: str | None = Field(
         None, min_length=1, max_length=LONGEST_STATUS,
-        description="How the episode ended: `obs` is what followed its last action, and the reply's action is unused.",
+        description="How the episode ended: `obs` is the observation after the last action; the reply's is unused.",
     )  # fmt: skip
-    truncated: bool = Field(False, description="With `final_status`: the episode was broken off, as by a time limit.")
+    truncated: bool = Field(False, description="With `final_status`: the episode was cut off, as by a time limit.")
 
 
 class ActReply(BaseModel):
     """An action, ready for the environment's `step`."""
 
-    action: Any = Field(description="Shaped as the action space is; for a batch, one such action per observation.")
+    action: Any = Field(description="In the action space's shape; for a batch, one such action per observation.")
     policy: str
     version: str
     seq: int | None = Field(None, description="As sent.")
-    infer_ms: float = Field(
-        description="Milliseconds for the observation's checks, the network and the action's checks."
-    )
-    state: dict[str, Any] | None = Field(None, description="For the next request, where you carry the state.")
+    infer_ms: float = Field(description="Milliseconds to check the observation, run the network and check the action.")
+    state: dict[str, Any] | None = Field(None, description="For the next request, if you carry the state.")
     session_id: str | None = Field(None, description="As sent.")
-    session_step: int | None = Field(None, description="Which action of the session's episode this is, from 1.")
-    warnings: list[str] | None = Field(None, description="What was out of bounds or limited, and used all the same.")
+    session_step: int | None = Field(None, description="Number of this action in the session's episode, from 1.")
+    warnings: list[str] | None = Field(None, description="Values out of bounds or limited that were used anyway.")
     timestamp: float | None = Field(None, description="As sent.")
     received_at: float | None = Field(None, description="The server's clock [s since 1970] when the request came.")
     sent_at: float | None = Field(None, description="The same when the reply was written.")
 
 
 class ErrorReply(BaseModel):
-    """Every answer that is not a success."""
+    """Body of every error reply."""
 
-    error: str = Field(description="A sentence: what was given, what was expected, which element.")
+    error: str = Field(description="A sentence that names what was given, what was expected and the element.")
     code: str = Field(description="Kebab-case, for programs: for example `bad-observation`.")
     details: dict[str, Any] | None = None
 
@@ -111,7 +109,7 @@ class Tensor(BaseModel):
 
 
 class InferRequest(BaseModel):
-    """Ask for a batch of actions."""
+    """Request a batch of actions."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -119,9 +117,9 @@ class InferRequest(BaseModel):
     parameters: dict[str, Any] | None = Field(
         None,
         description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
-        "`sequence_end`, `state_policy` (which the reply gave with the states), `binary_data_output`.",
+        "`sequence_end`, `state_policy` (from the reply that had the states), `binary_data_output`.",
     )
-    model_name: str | None = Field(None, description="The path's, if given at all.")
+    model_name: str | None = Field(None, description="Same name as in the path; optional.")
     inputs: list[Tensor]
     outputs: list[dict[str, Any]] | None = Field(
         None, description='`[{"name": "action", "parameters": {"binary_data": true}}]` for bytes after the JSON.'
@@ -145,12 +143,12 @@ class VersionStatus(BaseModel):
     state: str = Field(description="`loading`, `ready` or `failed`.")
     reason: str = Field(description="Why it failed; empty otherwise.")
     aliases: list[str]
-    loaded_at: str | None = Field(description="UTC; when this process had loaded and proven it.")
-    requests: int = Field(description="Answered by this process, over all protocols.")
+    loaded_at: str | None = Field(description="UTC time at which this process finished loading and proving it.")
+    requests: int = Field(description="Requests answered by this process, over all protocols.")
 
 
 class ShadowStatus(BaseModel):
-    """A version that computes along, and how it compares so far, in the process that answers."""
+    """A version whose actions are computed only for comparison, with its counts in the answering process."""
 
     version: str
     compared: int
@@ -164,26 +162,26 @@ class PolicySummary(BaseModel):
     """A policy and its versions."""
 
     name: str
-    version: str = Field(description="The default: where the alias `production` leads.")
-    versions: list[str] = Field(description="Those that answer, oldest first.")
+    version: str = Field(description="The default: the version that the alias `production` points to.")
+    versions: list[str] = Field(description="Versions that answer, oldest first.")
     description: str
     control_rate_hz: float | None
     aliases: dict[str, str]
-    previous: dict[str, str] = Field(description="Where a rollback of an alias would lead.")
+    previous: dict[str, str] = Field(description="Version to which a rollback of each alias would lead.")
     canary: Canary | None
     shadow: ShadowStatus | None
     version_states: list[VersionStatus]
 
 
 class PolicyList(BaseModel):
-    """What a process serves."""
+    """Policies served by one process."""
 
     policies: list[PolicySummary]
-    replica: str = Field(description="Which process answers; counts and states are its own.")
-    generation: int = Field(description="Number of the plan; the same number, the same policies.")
+    replica: str = Field(description="The answering process; counts and states are its own.")
+    generation: int = Field(description="Number of the plan; equal numbers mean equal policies.")
     changed_at: str | None
     changed_by: str | None
-    behind: list[str] = Field(description="What this process could not follow, a sentence each; usually empty.")
+    behind: list[str] = Field(description="Parts of the plan that this process could not follow; usually empty.")
 
 
 class ServerMetadata(BaseModel):
@@ -221,7 +219,7 @@ class ModelState(BaseModel):
     reason: str
 
 
-# By method and path without its version: body, reply, and the errors besides every route's.
+# By method and path without its version: body, reply, and errors besides those of every route.
 DESCRIBED: dict[tuple[str, str], tuple[Any, Any, tuple[int, ...]]] = {
     ("POST", "/v1/policies/{name}/act"): (ActRequest, ActReply, OF_ACTION),
     ("POST", "/v2/models/{name}/infer"): (InferRequest, InferReply, OF_ACTION),
@@ -241,7 +239,7 @@ BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "b
 
 
 def openapi(table: RoutingTable) -> bytes:
-    """Return the document as JSON; paths are relative to its own, under whatever prefix a proxy takes off."""
+    """Return the document as JSON; paths are relative to its own, so a proxy may strip a prefix."""
     app = FastAPI(title="rlservo", version=rlservo.__version__, description=DESCRIPTION, servers=[{"url": "."}])
     for route in table.routes:
         if route.method != WEBSOCKET and route.is_documented:
@@ -272,7 +270,7 @@ def _describe(app: FastAPI, route: Route) -> None:
 
 
 def _endpoint(route: Route, body: Any) -> Callable[..., Any]:
-    """Return a function with a route's parameters, whose signature is all that FastAPI reads of it."""
+    """Return a function with a route's parameters; FastAPI reads only its signature."""
 
     async def endpoint(**_given: Any) -> None: ...
 

@@ -1,6 +1,6 @@
-"""Recordings over HTTP: the files' names and sizes, and their bytes from any place on, for a remote learner.
+"""Recordings over HTTP: the files' names and sizes, and their bytes from any offset, for a remote learner.
 
-Files are only appended to, so a copy continues where it ended. Only an admin key may read them.
+Files only grow, so a copy continues at its end. Reading them needs an admin key.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def routes(handler: RequestHandler) -> list[Route]:
 
     def piece(file: str, begin: str) -> bytes:
         if not begin.isdigit() or len(begin) > 18:
-            raise RequestError(f"{begin[:40]!r} is not a byte of a recording: expected a number, 0 or more")
+            raise RequestError(f"{begin[:40]!r} is not an offset in a recording: expected a number, 0 or more")
         path = folder() / file
-        if path.suffix != ".mcap" or not path.is_file():  # perhaps deleted since it was listed: the oldest ones are
+        if path.suffix != ".mcap" or not path.is_file():  # perhaps deleted since it was listed, as the oldest ones are
             return b""
         with path.open("rb") as stream:
             stream.seek(int(begin))

@@ -14,7 +14,7 @@ from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.wire.asgi import ASGIApp
 
 GET, POST = "GET", "POST"
-WEBSOCKET = "WebSocket:"  # no method that a client can send: they have no colon
+WEBSOCKET = "WebSocket:"  # not a method that a client can send: those have no colon
 PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 PARAMETER = re.compile(r"\\{(\w+)\\}")  # in an escaped path
 
@@ -35,7 +35,7 @@ Answer: TypeAlias = Callable[[Call], Awaitable[tuple[bytes, Headers]]]
 
 @dataclass(frozen=True)
 class Route:
-    """A method and a path such as `/v1/policies/{name}`, and what answers there."""
+    """A method, a path such as `/v1/policies/{name}`, and its handler."""
 
     method: str
     path: str
@@ -43,9 +43,9 @@ class Route:
     summary: str
     answer: Answer | None = None
     app: ASGIApp | None = None
-    """In place of `answer`: of actions and streams, a callable that reads what it wants itself."""
+    """Instead of `answer`, for actions and streams: a callable that reads the body itself."""
     is_page: bool = False
-    """For browsers, which ask for HTML and not for JSON; for others there is no such route."""
+    """Only for browsers, which accept HTML and not JSON; for other clients there is no such route."""
     is_documented: bool = True
     """Whether it is in the OpenAPI document."""
 
@@ -53,24 +53,24 @@ class Route:
 def of_policy(
     method: str, prefix: str, suffix: str, summary: str, *, answer: Answer | None = None, app: ASGIApp | None = None
 ) -> list[Route]:
-    """Return the routes of a policy's default version, and of one version or of what an alias leads to."""
+    """Return the routes of a policy's default version, and of a version or an alias."""
     paths = (f"{prefix}/{{name}}{suffix}", f"{prefix}/{{name}}/versions/{{version}}{suffix}")
     return [Route(method, path, Access.act, summary, answer, app) for path in paths]
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The route of a connection, and its path's parameters; None where no route has the path, or none the method."""
+    """The route of a connection, and its path's parameters; None if no route has the path and method."""
 
     route: Route | None
     access: Access
     params: Mapping[str, str]
     allowed: tuple[str, ...] = ()
-    """The methods of the path, if there is such a path."""
+    """The methods of the path, if it exists."""
 
 
 class RoutingTable:
-    """The routes of an application; the first that fits counts."""
+    """The routes of an application; the first match counts."""
 
     def __init__(self, routes: Iterable[Route]) -> None:
         self.routes = tuple(routes)
@@ -82,9 +82,9 @@ class RoutingTable:
     def find(self, method: str, path: str, accept: bytes) -> Found:
         """Return the route of a connection with this `Accept` header.
 
-        A path with another method is guarded as its most guarded route is; one without any is for any key.
+        A path with another method has the access of its strictest route; an unknown path needs any key.
         """
-        if method == "HEAD":  # whose reply's body the engine leaves out
+        if method == "HEAD":  # the engine leaves out its reply's body
             method = GET
         known = self._remembered.get((method, path))
         if known is not None:

@@ -1,7 +1,7 @@
-"""Web page at `/` that shows what runs, for browsers alone: a program gets there what it gets where nothing is.
+"""Status page at `/`, only for browsers: a program gets the reply for an unknown path.
 
-The page is static: anyone may open it, without a key. What it shows it asks of `/v1/policies` and
-`/metrics`, with the key that its user types if the server wants one, from where it stays in a variable.
+The page is static: anyone may open it without a key. It fetches its content from `/v1/policies` and `/metrics`, with
+the key that its user types if the server requires one, which stays in a variable.
 
 Sources: Content Security Policy Level 3; Trusted Types (W3C).
 """
@@ -29,9 +29,9 @@ POLICY = (
     "img-src 'self'",
     "connect-src 'self'",
     "base-uri 'none'",
-    "form-action 'none'",  # the key's form is read by the script; where that does not run, it goes nowhere
+    "form-action 'none'",  # the script reads the key's form; if the script does not run, the form goes nowhere
     "frame-ancestors 'none'",
-    "require-trusted-types-for 'script'",  # text never becomes markup, not even by a mistake of the script
+    "require-trusted-types-for 'script'",  # text never becomes markup, not even through a bug in the script
     "trusted-types 'none'",
 )
 HEADERS = {

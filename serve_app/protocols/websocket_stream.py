@@ -1,11 +1,11 @@
-"""WebSocket per robot: the openpi policy server's protocol, which its clients speak unchanged.
+"""WebSocket per robot: the openpi policy server's protocol, compatible with its unchanged clients.
 
 On connecting the server sends one msgpack map, the metadata; then request and response alternate as binary frames
 (`msgpack_codec.py`). An error is a text frame with the JSON protocol's error body, then close 1011; a client that
-connects with `?errors=keep` gets the text frame alone, with the request's `seq`, and continues.
+connects with `?errors=keep` gets only the text frame, with the request's `seq`, and continues.
 
-The recurrent state is the connection's: at its start when the connection opens and after `reset`, gone with the
-connection. A client that would rather carry it sends `state`, as over JSON.
+The recurrent state belongs to the connection: it starts when the connection opens and after `reset`, and is lost with
+the connection. A client that prefers to carry it sends `state`, as over JSON.
 
 Source of the protocol: github.com/Physical-Intelligence/openpi, websocket_policy_server.py.
 """
@@ -54,7 +54,7 @@ GOING_AWAY = 1001
 KEEP = b"errors=keep"
 PROTOCOL = "websocket"
 SILENT = "silent for too long"
-REVOKED = (UnauthenticatedError, ForbiddenError)  # what the key of a stream may come to
+REVOKED = (UnauthenticatedError, ForbiddenError)  # possible failures of a stream's key
 
 
 def routes(handler: RequestHandler) -> list[Route]:
@@ -84,7 +84,7 @@ class StreamEndpoint:
         try:
             opening.policy, opening.version = self._address(scope["path_params"])
             opening.stream_id = new_episode_id(opening.label)
-            opening.label = opening.label or opening.stream_id  # when a canary runs they all get the same version
+            opening.label = opening.label or opening.stream_id  # during a canary they all get the same version
             policy = handler.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
             handler.record_failure(opening, error.code, error.message)
@@ -93,7 +93,7 @@ class StreamEndpoint:
         await receive()  # websocket.connect
         try:
             await send({"type": "websocket.accept", "headers": scope.get(REPLY_HEADERS, ())})
-        except OSError:  # the client has gone already
+        except OSError:  # the client has already disconnected
             return
         try:
             handler.open_stream(opening)
@@ -116,8 +116,8 @@ class StreamEndpoint:
             await _close_idle(send)
         except RlservoError as error:
             await fail_stream(send, error_answer(error)[1])
-        except OSError:  # the client went while its reply was being sent
-            logger.debug("a stream's client went before its reply could be sent")
+        except OSError:  # the client disconnected while its reply was being sent
+            logger.debug("a stream's client disconnected before its reply could be sent")
         except Exception:
             handler.record_bug(opening)
             await fail_stream(send, encode_bug())
@@ -128,14 +128,14 @@ class StreamEndpoint:
             handler.close_stream(opening)
 
     def _address(self, params: Mapping[str, str]) -> tuple[str, str | None]:
-        """Return (policy, version) that a path's parameters name; without any it is the default policy."""
+        """Return the (policy, version) in a path's parameters; without any, the default policy."""
         if "name" in params:
             return params["name"], params.get("version")
         names = self._handler.store().names
         default = self._handler.settings.default_policy or (names[0] if len(names) == 1 else None)
         if default is None:
             raise UnknownPolicyError(
-                f"this server has no default policy, but {', '.join(names)}: connect to /v1/policies/NAME/stream, or "
+                f"this server has no default policy among {', '.join(names)}: connect to /v1/policies/NAME/stream, or "
                 "serve with --default-policy (RLSERVO_DEFAULT_POLICY)",
                 {"policies": list(names)},
             )
@@ -143,7 +143,7 @@ class StreamEndpoint:
 
 
 class _Conversation:
-    """Answers the messages of one connection, one after the other."""
+    """Answers the messages of one connection in sequence."""
 
     def __init__(
         self, handler: RequestHandler, codec: MsgpackCodec, opening: Request, scope: Scope, idle: IdleTimer
@@ -186,12 +186,12 @@ class _Conversation:
         taken_s = time.perf_counter() - request.received
         self._timings = {"prev_total_ms": taken_s * 1e3}
         if taken_s > handler.admission.max_wait_s:
-            self._is_fresh = True  # the loop was blocked by this reply, and the next request comes after it
+            self._is_fresh = True  # this reply blocked the loop, and the next request comes after it
         return _binary(reply)
 
 
 class IdleTimer:
-    """Cancels the task that made it when nothing happened for a while: one callback a period, not a timer a wait."""
+    """Cancels the task that created it after a period of inactivity: one callback per period, not a timer per wait."""
 
     def __init__(self, seconds: float) -> None:
         """Start the clock for the current task."""
@@ -203,11 +203,11 @@ class IdleTimer:
         self.expired = False
 
     def touch(self) -> None:
-        """Begin the period again."""
+        """Restart the period."""
         self._touched = self._loop.time()
 
     def stop(self) -> None:
-        """Never cancel the task."""
+        """Stop the timer: the task is not cancelled any more."""
         self._handle.cancel()
 
     def _check(self) -> None:
@@ -220,14 +220,14 @@ class IdleTimer:
 
 
 def _with_seq(content: bytes, seq: int | None) -> str:
-    """Return an error's body with the number of the request that it answers."""
+    """Return an error's body with its request's number."""
     if seq is None:
         return content.decode()
     return encode_json({**json.loads(content), "seq": seq}).decode()
 
 
 async def _close_idle(send: Send) -> None:
-    with contextlib.suppress(OSError, RuntimeError):  # the client may have gone meanwhile
+    with contextlib.suppress(OSError, RuntimeError):  # the client may have disconnected
         await send({"type": "websocket.close", "code": GOING_AWAY, "reason": SILENT})
 
 

@@ -1,1 +1,1 @@
-"""Recorder: decisions of policies in MCAP files, written alongside the loop, read back, shown and converted."""
+"""Recordings of policies' decisions in MCAP files: written beside the control loop, read, shown and converted."""

@@ -1,4 +1,4 @@
-"""Parts of every conversion of a recording: episodes of one policy, a new folder, spaces as Gymnasium's."""
+"""Common parts of conversions: episodes of one policy, a new folder, Gymnasium's spaces."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from rlservo.serve_app.recording.reader import Recording
 def new_path(out: Path) -> Iterator[Path]:
     """Yield a temporary path that becomes `out` at the end, and is removed on failure.
 
-    Raises UsageError if `out` exists, unless as an empty folder.
+    Raises UsageError if `out` exists, unless it is an empty folder.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out} exists: give a new path")
     part = out.with_name(f".{out.name}.part")
-    _remove(part)  # of a conversion that was killed
+    _remove(part)  # left by a conversion that was killed
     part.parent.mkdir(parents=True, exist_ok=True)
     try:
         yield part
@@ -54,7 +54,7 @@ def _remove(path: Path) -> None:
 def episodes_of_one(recording: Recording, name: str | None) -> Iterator[Episode]:
     """Yield the episodes of one policy: `name`, or the only one.
 
-    Raises UsageError if the recording has several, or versions whose observations or actions differ.
+    Raises UsageError if the recording has several policies, or versions with different observations or actions.
     """
     chosen: Episode | None = None
     for episode in episodes(recording):
@@ -69,8 +69,8 @@ def episodes_of_one(recording: Recording, name: str | None) -> Iterator[Episode]
             )
         if spaces[0] != spaces[1]:
             raise UsageError(
-                f"{first.policy.title} and {episode.policy.title} have other observations or actions: "
-                "convert their files one by one"
+                f"{first.policy.title} and {episode.policy.title} have different observations or actions: convert "
+                "their files separately"
             )
         chosen = first
         yield episode

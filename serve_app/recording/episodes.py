@@ -1,7 +1,7 @@
-"""Episodes put together from a recording's messages: columns of numbers, one row a decision.
+"""Episodes assembled from a recording's messages: columns of numbers, one row per decision.
 
-It streams: an episode is yielded when it ends, a very long one in pieces, and of too many that never end the one that
-was silent longest is given up.
+It streams: an episode is yielded when it ends, a very long one in pieces, and if too many never end, the one that was
+silent longest is given up.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from rlservo.serve_app.recording.reader import Entry, Recording
 
 LONGEST_PIECE = 10_000  # decisions
 MOST_OPEN = 2_000  # episodes at a time
-LOOSE_PIECE = 1_000  # decisions that belong to no episode, at a time
+LOOSE_PIECE = 1_000  # decisions without an episode, at a time
 
 Columns = dict[str, NDArray[Any]]
 
 
 @dataclass
 class Episode:
-    """Decisions of one episode in their order, or a piece of it, or decisions that belong to none (`id` is empty)."""
+    """Decisions of one episode in order, or of a piece of it, or decisions without an episode (`id` is empty)."""
 
     policy: PolicyFormat
     id: str
@@ -65,12 +65,12 @@ class Episode:
 
     @cached_property
     def time_s(self) -> NDArray[np.float64]:
-        """Time of each decision [s since 1970], by a clock that never jumps."""
+        """Time of each decision [s since 1970], from a clock that never jumps."""
         return np.array(self._log_times_ns, np.float64) / 1e9
 
     @cached_property
     def wall_ns(self) -> NDArray[np.int64]:
-        """The same by the wall clock [ns since 1970]."""
+        """The same from the wall clock [ns since 1970]."""
         return np.array(self._wall_ns, np.int64)
 
     @cached_property
@@ -90,7 +90,7 @@ class Episode:
 
     @cached_property
     def fell_back(self) -> NDArray[np.bool_]:
-        """Whether the robot was sent another action."""
+        """Whether the robot got another action instead."""
         return np.array([one is not None for one in self._commands()], np.bool_)
 
     @cached_property
@@ -111,7 +111,7 @@ class Episode:
 
     @property
     def may_teach(self) -> bool:
-        """Whether all that was reported of it came with keys that may explore."""
+        """Whether everything reported about it came with keys that may explore."""
         return all(one is None or one.get("may_teach", True) for one in self._outcomes)
 
     @cached_property
@@ -145,7 +145,7 @@ class Episode:
 
     @cached_property
     def last_action_input(self) -> dict[int, Columns]:
-        """By row the action `[1, *shape]` that a limit on the step counted from, if the client gave it."""
+        """Return each row's action `[1, *shape]` from which a step limit counted, if the client sent it."""
         key = "last_action_input"
         given = [(row, one[key]) for row, one in enumerate(self._decisions) if key in one]
         return {row: self.policy.actions.columns([action]) for row, action in given}
@@ -169,12 +169,12 @@ class Episode:
 
     @property
     def warnings(self) -> list[tuple[int, str]]:
-        """Return (row, sentence) of every warning."""
+        """Return (row, sentence) for every warning."""
         return [(row, text) for row, one in enumerate(self._decisions) for text in one.get("warnings", ())]
 
     @property
     def errors(self) -> list[str | None]:
-        """Return for each row the reason for a missing action; None if there was one."""
+        """Return each row's reason for a missing action; None if there was an action."""
         return [one.get("error") for one in self._decisions]
 
     def field(self, name: str) -> list[Any]:
@@ -182,12 +182,12 @@ class Episode:
         return [one.get(name) for one in self._decisions]
 
     def part(self, begin: int, end: int, *, terminated: bool) -> Episode:
-        """Return rows `begin` to `end` (not included) as an episode; row `end` has the observation after it."""
+        """Return rows `begin` to `end` (exclusive) as an episode; row `end` has the observation after it."""
         rows = slice(begin, end)
         outcomes = list(self._outcomes[rows])
         if end < len(self):
             outcomes[-1] = {**(outcomes[-1] or {}), "final_obs": self._decisions[end]["obs"]}
-        begins = self.begins if begin == 0 else not self.policy.contract.state  # a memory was not reset there
+        begins = self.begins if begin == 0 else not self.policy.contract.state  # the state was not reset there
         return Episode(
             self.policy, self.id, begins=begins, ended=True, terminated=terminated,
             truncated=not terminated, _decisions=self._decisions[rows], _outcomes=outcomes,
@@ -209,7 +209,7 @@ class Episode:
 
 
 def episodes(recording: Recording) -> Iterator[Episode]:
-    """Yield every episode of a recording as it ends, then those that did not."""
+    """Yield every episode of a recording as it ends, then the unfinished ones."""
     assembler = EpisodeAssembler()
     for entry in recording.entries():
         yield from assembler.add(entry)
@@ -221,7 +221,7 @@ class EpisodeAssembler:
 
     def __init__(self) -> None:
         self.opened: OrderedDict[tuple[int, str], Episode] = OrderedDict()
-        """The episodes that have not ended, by policy and id; the longest silent come first."""
+        """The episodes that have not ended, by policy and id; those silent longest come first."""
 
     def add(self, entry: Entry) -> Iterator[Episode]:
         """Take the next message and yield the episodes, or pieces of one, that end with it."""
@@ -236,7 +236,7 @@ class EpisodeAssembler:
             yield self.opened.popitem(last=False)[1]
 
     def give_up(self, before_ns: int) -> Iterator[Episode]:
-        """Yield the open episodes whose last decision came before a log time."""
+        """Yield and drop the open episodes whose last decision came before a log time."""
         while self.opened and next(iter(self.opened.values()))._log_times_ns[-1] < before_ns:
             yield self.opened.popitem(last=False)[1]
 
@@ -247,7 +247,7 @@ def _add_decision(
     episode = opened.get(key)
     step = entry.fields["step"]
     if episode is not None and key[1] and 0 < step == episode._decisions[-1]["step"]:
-        episode._drop_last()  # decided again: the client had no answer to the first request
+        episode._drop_last()  # decided again: the client did not get the first answer
     first = True
     if episode is not None:
         begins_anew = bool(key[1] and episode._decisions) and step <= episode._decisions[-1]["step"]

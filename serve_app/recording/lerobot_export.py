@@ -1,7 +1,7 @@
-"""A recording as a LeRobotDataset v3.0: data, episodes, tasks, info and statistics, written with pyarrow alone.
+"""A recording as a LeRobotDataset v3.0: data, episodes, tasks, info and statistics, written only with pyarrow.
 
-The layout is LeRobot's documented one (huggingface.co/docs/lerobot/lerobot-dataset-v3): one file of frames, one of
-episodes with each one's own statistics, whose columns are named `stats/<feature>/<figure>`.
+The layout is LeRobot's documented one (huggingface.co/docs/lerobot/lerobot-dataset-v3): one file of frames, and one of
+episodes with their statistics, whose columns are named `stats/<feature>/<figure>`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EPISODES_FILE = "meta/episodes/chunk-000/file-000.parquet"
 QUANTILES = {"q01": 1, "q10": 10, "q50": 50, "q90": 90, "q99": 99}
 DEFAULT_FPS = 10
 REWARD = "next.reward"
-TASKS_FOR_PANDAS = {  # LeRobot looks tasks up by their sentence: it is the table's index
+TASKS_FOR_PANDAS = {  # LeRobot looks up tasks by their sentence, the table's index
     "index_columns": ["task"],
     "column_indexes": [],
     "columns": [
@@ -77,8 +77,8 @@ def _write(
                 ("lacks rewards", "has them") if REWARD in writer.schema.names else ("has rewards", "lacks them")
             )
             raise UsageError(
-                f"episode {episode.id!r} {which}, and the one before it {before}: all frames of a LeRobotDataset have "
-                "the same columns; convert recordings with and without rewards separately, or to parquet"
+                f"episode {episode.id!r} {which}, and the one before it {before}: all frames of a LeRobotDataset need "
+                "the same columns: convert recordings with and without rewards separately, or to parquet"
             )
         writer.write_table(table)
         row: dict[str, Any] = {

@@ -1,7 +1,7 @@
-"""One MCAP file being written: channels, JSON messages, a chunk each flush.
+"""One MCAP file that is being written: channels, JSON messages, one chunk per flush.
 
-A file is readable to its last flush, even if its writer is killed. Times are two: a message's log time continues with
-the monotonic clock from the file's start, so that plots never run backwards, and its publish time is the wall clock's.
+A file is readable to its last flush, even if its writer is killed. A message has two times: its log time follows the
+monotonic clock from the file's start, so that plots never run backwards; its publish time is the wall clock's.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 
 PROFILE = "rlservo"
 CHUNK_BYTES = 256 * 1024
-YIELD_EVERY = 8  # messages written at a stretch before other threads get the interpreter
-YIELD_S = 2e-5  # a sleep of 0 has the interpreter back before a thread that waits for it is awake
+YIELD_EVERY = 8  # messages written before other threads get the interpreter
+YIELD_S = 2e-5  # after a sleep of 0 this thread would get the interpreter back before a waiting one is awake
 DROPPED_TOPIC = "/rlservo/dropped"
 
 
 class LogFile:
-    """An MCAP file that this process writes and holds a lock on: others may read it, and do not delete it."""
+    """An MCAP file that this process writes and locks: others may read it, but do not delete it."""
 
     def __init__(self, path: Path) -> None:
-        """Create `path`, readable by its owner alone. Raises OSError, FileExistsError if it exists."""
+        """Create `path`, readable only by its owner. Raises OSError, FileExistsError if it exists."""
         self.path = path
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        fcntl.flock(descriptor, fcntl.LOCK_EX)  # ends with the process, however that ends
+        fcntl.flock(descriptor, fcntl.LOCK_EX)  # released when the process ends, for whatever reason
         self._stream = os.fdopen(descriptor, "wb")
         self._wall_ns, self._monotonic_ns = time.time_ns(), time.monotonic_ns()
         self._channels: dict[tuple[PolicyFormat | None, str], int] = {}
@@ -69,7 +69,7 @@ class LogFile:
 
     @property
     def is_deleted(self) -> bool:
-        """Whether it can no longer be opened: later writes are lost."""
+        """Whether the file has been deleted: later writes are lost."""
         return os.fstat(self._stream.fileno()).st_nlink == 0
 
     @property
@@ -77,7 +77,7 @@ class LogFile:
         return (time.monotonic_ns() - self._monotonic_ns) / 1e9
 
     def add_decision(self, record: DecisionRecord) -> None:
-        """Write a decision, of a batch one for each row. Raises ValueError or RequestError if it does not fit."""
+        """Write a decision, or one per row of a batch. Raises ValueError or RequestError if it does not fit."""
         policy, own, inputs = record.policy, record.own_action, record.dist_inputs
         columns = [_member("obs", policy.observations.encode_rows(record.obs))]
         for name, action in (
@@ -116,14 +116,14 @@ class LogFile:
         self._add_rows("outcome", record, columns, _members(ending))
 
     def add_dropped(self, count: int) -> None:
-        """Mark that `count` records are missing before this place."""
+        """Note that `count` records are missing at this place."""
         channel = self._channel(None, "dropped")
         self._sequence += 1
         now = time.time_ns()
         self._writer.add_message(channel, self._log_time(time.monotonic_ns()), b'{"count":%d}' % count, now)
 
     def flush(self) -> None:
-        """Hand everything to the operating system: it survives this process."""
+        """Hand everything to the operating system, so that it survives this process."""
         self._writer.flush()
 
     def close(self) -> None:
@@ -135,13 +135,13 @@ class LogFile:
 
     def abandon(self) -> None:
         """Close without an index, after a failed write."""
-        with contextlib.suppress(OSError):  # it tries once more to write what it still holds
+        with contextlib.suppress(OSError):  # the writer tries once more to write its buffer
             self._stream.close()
 
     def _add_rows(
         self, kind: str, record: DecisionRecord | OutcomeRecord, columns: list[list[bytes]], shared: list[bytes]
     ) -> None:
-        """Write a message for each row: its own members in `columns` and the shared ones."""
+        """Write a message for each row: its own members from `columns`, and the shared ones."""
         channel = self._channel(record.policy, kind)
         log_time = self._log_time(record.monotonic_ns)
         for row, members in enumerate(zip(*columns, strict=True) if columns else [()] * record.rows):
@@ -219,6 +219,6 @@ def _details(record: DecisionRecord) -> list[bytes]:
 
 
 def _rewards(name: str, reward: Any, rows: int) -> list[bytes]:
-    """Return one reward a row, of one for each, or one for all."""
+    """Return one reward per row, from one for each, or one for all."""
     rewards = np.broadcast_to(np.ravel(np.asarray(reward, np.float64)), rows)
     return _member(name, json_rows(np.ascontiguousarray(rewards)[:, None]))

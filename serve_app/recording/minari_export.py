@@ -26,10 +26,10 @@ PATH_VARIABLE = "MINARI_DATASETS_PATH"
 def export_minari(recording: Recording, out: str | Path, *, name: str | None = None) -> tuple[str, int, str | None]:
     """Write a dataset into the new folder `out` and return (its id, episodes, the id of its environment).
 
-    `MINARI_DATASETS_PATH=out`, an absolute path, lets minari load it by that id. The environment, which minari's
-    `recover_environment` makes, is the one that the policy was trained in, None if this Python does not have it with
-    the policy's observations and actions. Minari's episodes need every reward, an end and the
-    observation after the last action: others are left out. Raises UsageError if nothing is left, and RecordingError.
+    `MINARI_DATASETS_PATH=out`, an absolute path, lets minari load it by that id. The environment for minari's
+    `recover_environment` is the one that the policy was trained in; None if it is not installed here with the policy's
+    observations and actions. Minari's episodes need every reward, an end and the observation after the last action:
+    others are left out. Raises UsageError if nothing is left, and RecordingError.
     """
     minari = optional_package("minari", "an export to Minari")
     collector = optional_package("minari.data_collector", "an export to Minari")
@@ -63,7 +63,7 @@ def export_minari(recording: Recording, out: str | Path, *, name: str | None = N
     spaces = gym_space(contract.observation_space), gym_space(contract.action_space)
     env = _environment(contract.provenance, spaces)
     with new_path(Path(out)) as folder, _datasets_in(folder), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that there is no author, or no environment
+        warnings.simplefilter("ignore", UserWarning)  # that author or environment is missing
         folder.mkdir()
         minari.create_dataset_from_buffers(
             identity,
@@ -79,14 +79,14 @@ def export_minari(recording: Recording, out: str | Path, *, name: str | None = N
 
 
 def _environment(origin: Provenance, spaces: tuple[Any, Any]) -> Any:
-    """Return the Gymnasium specification of the training's environment, if it can be made and has these spaces."""
+    """Return the Gymnasium specification of the training environment, if it can be made and has these spaces."""
     import gymnasium as gym
 
-    if ":" in (origin.env_id or ":"):  # a module, which a recording shall not import
+    if ":" in (origin.env_id or ":"):  # a module, which a recording must not import
         return None
     try:
         env = gym.make(importing_id(str(origin.env_id)), disable_env_checker=True, **origin.env_config)
-    except Exception:  # a constructor is anyone's code
+    except Exception:  # a constructor is third-party code
         return None
     env.close()
     return env.spec if (env.observation_space, env.action_space) == spaces else None
@@ -107,7 +107,7 @@ def _is_whole(episode: Episode) -> bool:
 
 @contextmanager
 def _datasets_in(folder: Path) -> Iterator[None]:
-    """Let minari keep its datasets in `folder`: it reads the place only from the environment."""
+    """Let minari keep its datasets in `folder`, which it reads only from the environment."""
     before = os.environ.get(PATH_VARIABLE)
     os.environ[PATH_VARIABLE] = str(folder.resolve())
     try:

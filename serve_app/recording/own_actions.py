@@ -1,7 +1,7 @@
 """A module's own actions in a recorded episode, for RLlib's learners.
 
-A record has the own action if it explored. If it has none, or the robot did something else (a fallback, a step
-limit), the executed action is taken back through unsquash and clip.
+A record has the own action if it explored. If it has none, or the robot did something else (a fallback, a step limit),
+unsquash and clip are inverted on the executed action.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rlservo.export.contract.scores import split_parameters
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, LeafSpec, MultiDiscreteSpec, leaf_specs
 from rlservo.serve_app.recording.episodes import Columns, Episode
 
-ROUNDING = 1e-5  # of a Box's span: an own action that is sent as what was executed, but for its float32
+ROUNDING = 1e-5  # of a Box's span: allowed float32 difference between an own action as sent and the executed one
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class OwnActions:
     leaves: Columns
     """By tensor name, `[rows, *shape]`."""
     known: NDArray[np.bool_]
-    """Rows whose own action is known; the others hold some number."""
+    """Rows whose own action is known; other rows are undefined."""
     recorded: NDArray[np.bool_]
-    """Rows whose own action, or its distribution, was recorded; the others that are known are computed."""
+    """Rows whose own action, or its distribution, was recorded; other known ones are computed."""
     clipped: NDArray[np.bool_]
-    """Rows whose own action is computed and lies at the bound or anywhere beyond it: the bound stands for it."""
+    """Rows whose own action is computed and lies at the bound or beyond it: the bound represents it."""
 
 
 def own_actions(episode: Episode) -> OwnActions:
-    """Return the own action of every row, if it can be known."""
+    """Return the own action of every row where it can be determined."""
     contract = episode.policy.contract
     transform = transform_of(contract)
     specs = leaf_specs(contract.action_space, "action")
@@ -58,7 +58,7 @@ def own_actions(episode: Episode) -> OwnActions:
 def modes(episode: Episode) -> OwnActions:
     """Return the policy's actions without exploring: its distributions' most likely ones.
 
-    Rows that did not explore have their own action; no row is `known` that holds a fallback's.
+    Rows that did not explore have their own action; rows with a fallback's are not `known`.
     """
     own = own_actions(episode)
     distribution = episode.policy.contract.distribution

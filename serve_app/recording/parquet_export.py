@@ -1,4 +1,4 @@
-"""A recording as one Parquet file: a row a decision, a list column per tensor, with its outcome."""
+"""A recording as one Parquet file: one row per decision and its outcome, a list column per tensor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rlservo.serve_app.recording.reader import Recording
 
 
 def export_parquet(recording: Recording, out: str | Path, *, name: str | None = None) -> int:
-    """Write the new file `out` and return its rows; the contract is in the schema's metadata.
+    """Write the new file `out` and return its number of rows; the contract is in the schema's metadata.
 
     Columns: eps_id, t, time, obs..., actions..., own_actions..., own_actions_clipped, action_logp, action_dist_inputs,
     rewards, terminateds, truncateds, explore, fell_back, error, latency_ms, version. `actions` are what the robot

@@ -25,7 +25,7 @@ def plot_episode(recording: Recording, number: int, out: str | Path) -> Episode:
     figures = optional_package("matplotlib.figure", "a plot")
     episode = next(islice(episodes(recording), number, None), None)
     if episode is None:
-        raise UsageError(f"the recording has no episode {number}: count from 0 (`rlservo log info` has their number)")
+        raise UsageError(f"the recording has no episode {number}: count from 0 (see `rlservo log info`)")
     panels = [*_panels(episode.obs, episode.policy.observations), *_panels(episode.executed, episode.policy.actions)]
     rows = len(panels) + 2
     figure = figures.Figure(figsize=(10, 1.6 * rows), layout="constrained")

@@ -1,4 +1,4 @@
-"""Messages of one policy: its contract's spaces as JSON, each element by its own name, and back bit for bit.
+"""Messages of one policy: its contract's spaces as JSON with named elements, and back bit for bit.
 
 A float32 is written with the fewest digits that give the same float32 again.
 """
@@ -53,7 +53,7 @@ class PolicyFormat:
 
     @property
     def record_bytes(self) -> int:
-        """Approximate memory of one decision while it waits for the writer."""
+        """Approximate memory [bytes] of one decision that waits for the writer."""
         spaces = (self.contract.observation_space, self.contract.action_space)
         return 1000 + sum(
             leaf.size * np.dtype(leaf.dtype).itemsize for space in spaces for leaf in leaf_specs(space, "").values()
@@ -67,7 +67,7 @@ class PolicyFormat:
 
 
 class SpaceFormat:
-    """Values of one space as JSON text, and as columns of many values."""
+    """Values of one space as JSON text, and in columns."""
 
     def __init__(self, space: SpaceSpec, path: str) -> None:
         self._space = space
@@ -106,7 +106,7 @@ class SpaceFormat:
         return self._schema(self._space, self._path)
 
     def labels(self, name: str) -> list[str]:
-        """Return the name of each element of a leaf."""
+        """Return the names of a leaf's elements."""
         return self._formats[name].labels(name)
 
     def _parts(self, value: Any) -> Mapping[str, Any]:
@@ -158,7 +158,7 @@ def _total_size(value: Any) -> int:
 
 
 def _children(space: SpaceSpec) -> list[tuple[str, SpaceSpec]]:
-    """Return a nested space's parts by key. A Tuple is an object too: viewers want an array's items of one kind."""
+    """Return a nested space's parts by key. A Tuple is also an object: viewers need array items of one kind."""
     if isinstance(space, DictSpec):
         return list(space.spaces.items())
     assert isinstance(space, TupleSpec), "a leaf has no parts"
@@ -166,7 +166,7 @@ def _children(space: SpaceSpec) -> list[tuple[str, SpaceSpec]]:
 
 
 class _LeafFormat:
-    """One array: an object by element name if all elements have one, else a flat array; a choice is a number."""
+    """One array: an object by element name if all elements are named, else a flat array; a choice is a number."""
 
     def __init__(self, path: str, leaf: LeafSpec) -> None:
         self._path, self._leaf = path, leaf
@@ -182,7 +182,7 @@ class _LeafFormat:
     def array(self, value: Any) -> NDArray[Any]:
         """Return `[rows, *shape]`."""
         array, shape = np.asarray(value), self._shape
-        if not shape and array.shape[1:] == (1,):  # a batch of choices with an axis of their own
+        if not shape and array.shape[1:] == (1,):  # a batch of choices with their own axis
             array = array[:, 0]
         if array.shape != shape and array.shape[1:] != shape:
             raise ValueError(f"{self._path} has shape {array.shape}, expected {shape}")
@@ -223,7 +223,7 @@ class _LeafFormat:
     def _number(self, unit: str) -> dict[str, Any]:
         number: dict[str, Any] = {"type": "number" if np.dtype(self._leaf.dtype).kind == "f" else "integer"}
         if isinstance(self._leaf, DiscreteSpec):
-            number["description"] = f"one of {self._leaf.n} from {self._leaf.start} on"
+            number["description"] = f"one of {self._leaf.n}, counted from {self._leaf.start}"
         if unit:
             number |= {"description": f"[{unit}]", "unit": unit}
         return number
@@ -236,24 +236,24 @@ def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
         f"Decision of {policy.title}",
         {
             "episode": _text("Session, stream or loop; absent if unknown"),
-            "step": _integer("Which decision of the episode, from 0"),
+            "step": _integer("Number of the decision in the episode, from 0"),
             "obs": policy.observations.schema(),
-            "action": {**action, "description": "As sent; absent if there was none"},
-            "commanded": {**action, "description": "What the robot was commanded instead of an action"},
+            "action": {**action, "description": "The action as sent; absent if there was none"},
+            "commanded": {**action, "description": "The robot's command instead of an action"},
             "own_action": {**action, "description": "The module's own action, before unsquash, clip and start"},
             "dist_inputs": {"type": "array", "items": {"type": "number"}, "description": "null: minus infinity"},
             "logp": {"type": "number", "description": "Log-probability of own_action"},
             "explore": {"type": "boolean"},
-            "reward_input": {"type": "number", "description": "The reward that the policy was given to see"},
+            "reward_input": {"type": "number", "description": "The policy's reward input"},
             "last_action_input": {
                 **action,
-                "description": "What a limit on the step counted from, if the client sent it",
+                "description": "The action from which a step limit counted, if the client sent it",
             },
             "latency_ms": {"type": "number", "description": "[ms]", "unit": "ms"},
             "seq": _integer("The request's number"),
             "request_id": _text("The request's id in the server's log"),
             "warnings": {"type": "array", "items": {"type": "string"}},
-            "error": _text("The code of what came instead of an action"),
+            "error": _text("The error code instead of an action"),
         },
     )
 
@@ -268,20 +268,20 @@ def outcome_schema(policy: PolicyFormat) -> dict[str, Any]:
             "reward": {"type": "number"},
             "terminated": {"type": "boolean"},
             "truncated": {"type": "boolean"},
-            "final_status": _text("How the episode ended, in the environment's word"),
+            "final_status": _text("How the episode ended, in the environment's words"),
             "final_obs": {**policy.observations.schema(), "description": "The observation after the last action"},
-            "commanded": {**policy.actions.schema(), "description": "What the robot was commanded instead"},
-            "robot": _object("Of a real robot", _ROBOT),
+            "commanded": {**policy.actions.schema(), "description": "The robot's command instead of the action"},
+            "robot": _object("Facts about a real robot", _ROBOT),
             "may_teach": {"type": "boolean", "description": "false: reported with a key that may not explore"},
         },
     )
 
 
 _ROBOT: dict[str, Any] = {
-    "state": {"type": "string", "description": "Of the state machine around the policy; 'human': taken over"},
+    "state": {"type": "string", "description": "State of the machine around the policy; 'human': led by a person"},
     "changes": {
         "type": "array",
-        "description": "Of the state, since the last decision",
+        "description": "Changes of the state since the last decision",
         "items": {
             "type": "object",
             "properties": {
@@ -297,14 +297,14 @@ _ROBOT: dict[str, Any] = {
 
 DROPPED_SCHEMA: dict[str, Any] = {
     "$schema": "https://json-schema.org/draft/2020-12/schema",
-    "title": "Records that did not fit into the buffer and are missing before this place",
+    "title": "Number of records that are missing before this place because the buffer was full",
     "type": "object",
     "properties": {"count": {"type": "integer"}},
 }
 
 
 def element_differences(recorded: Contract, other: Contract) -> Iterator[str]:
-    """Yield a sentence for each difference between two contracts that makes one's records unusable for the other."""
+    """Yield a sentence for each difference between two contracts that makes records unusable for the other."""
     for side, ours, theirs in (
         ("observation", recorded.observation_space, other.observation_space),
         ("action", recorded.action_space, other.action_space),
@@ -326,7 +326,7 @@ def _leaf_differences(name: str, ours: LeafSpec, theirs: LeafSpec, *, bounds: bo
     if ours.elements and theirs.elements:
         for index, (mine, yours) in enumerate(zip(ours.elements, theirs.elements, strict=True)):
             if mine.name != yours.name:
-                yield f"element {index} of the {name} is {mine.name!r} there and {yours.name!r} in the bundle"
+                yield f"element {index} of the {name} is {mine.name!r}, but {yours.name!r} in the bundle"
             elif mine.unit != yours.unit and mine.unit and yours.unit:
                 yield f"element {index} of the {name} ({mine.name}) is in {mine.unit} there and {yours.unit} here"
     discrete = ours.kind in ("discrete", "multi_discrete")

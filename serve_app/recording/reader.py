@@ -1,7 +1,7 @@
-"""Recordings read back: one pass over the messages of MCAP files, to the last whole chunk of each.
+"""Reader of recordings: one pass over the messages of MCAP files, to the last whole chunk of each.
 
-A file without an end (its writer was killed, or is still writing) is read as far as it goes. Memory is bounded: a chunk
-is in it at a time.
+A file without an end (its writer was killed, or is still writing) is read as far as possible. Memory is bounded to one
+chunk.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from rlservo.serve_app.recording.log_file import DROPPED_TOPIC
 from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.recording.recorder import SUFFIX, is_being_written
 
-LARGEST_RECORD = 512 * 1024 * 1024  # a larger length is damage
+LARGEST_RECORD = 512 * 1024 * 1024  # a larger length means damage
 CLOCK_JUMP_NS = 1_000_000_000
-BAG_PROFILE = "ros2"  # of what `ros2 bag record` writes
+BAG_PROFILE = "ros2"  # profile of files that `ros2 bag record` writes
 
 
 class RecordingError(RlservoError):
-    """The path holds no recording of rlservo's."""
+    """The path holds no rlservo recording."""
 
     code = "recording-invalid"
 
@@ -48,12 +48,12 @@ class Entry:
 
 @dataclass
 class FileFacts:
-    """Result of reading one file."""
+    """Facts about one file that was read."""
 
     path: Path
     metadata: dict[str, str] = field(default_factory=dict)
     whole: bool = False
-    """Whether the file has its end; else it was read to its last whole chunk."""
+    """Whether the file has its end; otherwise it was read to its last whole chunk."""
     being_written: bool = False
     damage: str | None = None
     """Damage beyond a missing end."""
@@ -62,7 +62,7 @@ class FileFacts:
     messages: int = 0
     dropped: int = 0
     clock_jumps: int = 0
-    """Number of times that the wall clock moved by more than a second against the monotonic clock."""
+    """Number of jumps of the wall clock by more than a second, relative to the monotonic clock."""
     profile: str = ""
     """'rlservo', or 'ros2' for a bag."""
     bag_topics: dict[str, int] = field(default_factory=dict)
@@ -90,12 +90,12 @@ class Recording:
         self.files: list[FileFacts] = []
         """Facts of the files that were read so far."""
         self.policies: list[PolicyFormat] = []
-        """Policies that were met so far; the same object for the same policy of several files."""
+        """Policies found so far; the same object for the same policy in several files."""
 
     def entries(self) -> Iterator[Entry]:
         """Yield every decision and outcome, in the order they were written.
 
-        Raises RecordingError if a file is not an MCAP file, or another program's.
+        Raises RecordingError if a file is not an MCAP file, or was written by another program.
         """
         self.files = []
         for path in self.paths:
@@ -104,7 +104,7 @@ class Recording:
             yield from FileReader(self, facts).entries()
 
     def known(self, policy: PolicyFormat) -> PolicyFormat:
-        """Return the object of this policy."""
+        """Return the known object for this policy."""
         for known in self.policies:
             if known.key == policy.key:
                 return known
@@ -113,7 +113,7 @@ class Recording:
 
 
 def read_records(facts: FileFacts) -> Iterator[McapRecord]:
-    """Yield what is in the file `facts.path` from `facts.position`, chunks taken apart, to its last whole chunk.
+    """Yield the records of the file `facts.path` from `facts.position` to its last whole chunk, with chunks unpacked.
 
     Sets `whole` and `damage` at the end. Raises RecordingError if it is not an MCAP file.
     """
@@ -122,7 +122,7 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
     def damaged(error: Exception) -> None:
         """A last chunk that is cut off is a missing end; anything before it is damage."""
         if stream.tell() < path.stat().st_size:
-            facts.damage = f"damaged before byte {stream.tell()}, read up to there: {first_line(error)}"
+            facts.damage = f"damaged before byte {stream.tell()} and read up to there: {first_line(error)}"
 
     with path.open("rb") as stream:
         try:
@@ -136,7 +136,7 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
                 else:
                     yield record
                 facts.position = stream.tell()
-            facts.whole = True  # the footer and the closing magic were there
+            facts.whole = True  # footer and closing magic were present
         except InvalidMagic:
             if stream.tell() <= len(b"\x89MCAP0\r\n"):
                 raise RecordingError(f"{path} is not an MCAP file") from None
@@ -152,7 +152,7 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
 
 
 class FileReader:
-    """One pass over one file, in one call of `entries` for each addition by its writer."""
+    """One pass over one file, with one call of `entries` for each addition by its writer."""
 
     def __init__(self, recording: Recording, facts: FileFacts) -> None:
         self._recording = recording
@@ -169,7 +169,7 @@ class FileReader:
                 entry = self._take(record)
             except RecordingError:
                 raise
-            except Exception as error:  # a message that rlservo did not write
+            except Exception as error:  # a message not written by rlservo
                 self._facts.damage = f"read up to a message that cannot be decoded: {first_line(error)}"
                 break
             if entry is not None:
@@ -177,7 +177,7 @@ class FileReader:
         is_bag = self._recording.with_bags and self._facts.profile == BAG_PROFILE
         if self._foreign and not self._channels and not is_bag:
             raise RecordingError(
-                f"{self._facts.path} holds no decisions of rlservo's policies: its topics are "
+                f"{self._facts.path} holds no rlservo decisions: its topics are "
                 f"{', '.join(sorted(self._foreign.values())[:5])}"
             )
 

@@ -20,7 +20,7 @@ from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 
 
 class WithRecording(ActingPolicy):
-    """A policy that records its observations and actions; `outcome` adds the control loop's knowledge.
+    """A policy that records its observations and actions; `outcome` adds rewards and episode ends.
 
     ```python
     with WithRecording(Policy.load("policies/ur5"), "run.mcap") as policy:
@@ -30,7 +30,7 @@ class WithRecording(ActingPolicy):
         policy.outcome(reward, terminated=terminated, truncated=truncated, final_obs=obs)
     ```
 
-    It records one loop's episodes: each loop has a policy of its own; they may share a Recorder.
+    It records the episodes of one loop: each loop needs its own policy; they may share a Recorder.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class WithRecording(ActingPolicy):
     ) -> None:
         """Record to the new file `record` (.mcap), into the folder `record`, or with an existing Recorder.
 
-        `wait` is the Recorder's; `act` replaces `policy.act` if a policy records itself.
+        `wait` is the Recorder's; `act` replaces `policy.act` for a policy that records itself.
         """
         self._policy = policy
         self._act = policy.act if act is None else act
@@ -77,7 +77,7 @@ class WithRecording(ActingPolicy):
         self, obs: Observation, *, explore: bool = False, seed: int | None = None, reward: ArrayLike | None = None
     ) -> Any:
         """Return the policy's action and record it; its exceptions are recorded and raised."""
-        seen = _copy(obs)  # an environment may write into what it gave
+        seen = _copy(obs)  # an environment may overwrite its observation later
         more: dict[str, Any] = {} if reward is None else {"reward": reward}
         wall_ns, monotonic_ns, began = time.time_ns(), time.monotonic_ns(), time.perf_counter()
         action, error = None, None
@@ -111,7 +111,7 @@ class WithRecording(ActingPolicy):
     ) -> None:
         """Record the last action's reward and whether the episode ended with it, and pass it on to a client.
 
-        `final_obs` is the observation after an episode's last action. Nothing to do before the first action.
+        `final_obs` is the observation after an episode's last action. Does nothing before the first action.
         """
         brought: dict[str, Any] = {
             "terminated": terminated, "truncated": truncated, "final_status": final_status, "final_obs": final_obs
@@ -155,7 +155,7 @@ class WithRecording(ActingPolicy):
         self._episode, self._step = uuid.uuid4().hex[:16], 0
 
     def end(self) -> None:
-        """End only the recording; a Recorder that was given continues."""
+        """End only the recording; a Recorder passed in continues."""
         if self._own is not None:
             self._own.close()
 
@@ -172,7 +172,7 @@ class WithRecording(ActingPolicy):
     def _known_format(self, has_acted: bool) -> PolicyFormat | None:
         """Return the policy's format; None before a server has sent its contract."""
         if has_acted and (self._format is None or self._policy.contract is not self._format_contract):
-            self._format_contract = self._policy.contract  # of a client's, another version may answer by now
+            self._format_contract = self._policy.contract  # for a client, another version may answer by now
             options = getattr(self._source, "options", None)
             self._format = self.recorder.policy(
                 self._format_contract,

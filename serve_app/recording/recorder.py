@@ -1,8 +1,8 @@
 """Recorder: a bounded buffer on the hot path, and a thread that writes it to MCAP files.
 
-Recording never gets in the way of acting: `record` takes a microsecond and raises nothing, what does not fit into the
-buffer is dropped and counted (and the file marks where), and when a file cannot be written recording ends with one
-line in the log.
+Recording never delays acting: `record` takes a microsecond and raises nothing; records that do not fit into the buffer
+are dropped and counted (and the file notes where); if a file cannot be written, recording ends with one line in the
+log.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ FILE_NAME = re.compile(r"^rlservo-[0-9]{8}T[0-9]{6}-[^/\n]+-[0-9]+-[0-9]+\.mcap\
 MIB = 1024 * 1024
 BUFFER_RECORDS = 20_000
 BUFFER_BYTES = 64 * MIB
-DRAIN_S = 0.1  # between two looks into the buffer
-FLUSH_S = 0.7  # together under a second: that much a killed process loses
-WAIT_S = 10.0  # for the writer to finish at close
+DRAIN_S = 0.1  # between two checks of the buffer
+FLUSH_S = 0.7  # together under a second, the most that a killed process loses
+WAIT_S = 10.0  # time for the writer to finish at close
 
 
 class Recorder(Closeable):
@@ -48,7 +48,7 @@ class Recorder(Closeable):
         recorder.record(DecisionRecord(policy, obs, action))
     ```
 
-    Any thread may record. Several processes may record into one folder: each has files of its own.
+    Any thread may record. Several processes may record into one folder: each has its own files.
     """
 
     def __init__(
@@ -62,13 +62,13 @@ class Recorder(Closeable):
     ) -> None:
         """Record to the new file `path` if that ends in .mcap, else into the folder `path`.
 
-        A folder's file is ended at `max_file_bytes` or after `max_file_s`; of a folder beyond `max_folder_bytes` the
-        oldest recordings that are not being written are deleted. With `wait` a full buffer blocks the caller instead of
-        dropping: for a simulation, which has the time. Raises UsageError if nothing can be written there.
+        In a folder, a new file begins at `max_file_bytes` or after `max_file_s`; beyond `max_folder_bytes` the oldest
+        recordings that are not being written are deleted. With `wait` a full buffer blocks the caller instead of
+        dropping records, for a simulation that can wait. Raises UsageError if nothing can be written there.
         """
         if max_file_bytes < MIB or max_file_s <= 0 or max_folder_bytes < 2 * max_file_bytes:
             raise UsageError(
-                f"a recording's file needs at least {MIB} bytes and its folder room for two, got max_file_bytes "
+                f"a recording's file needs at least {MIB} bytes and its folder room for two files, got max_file_bytes "
                 f"{max_file_bytes}, max_file_s {max_file_s:g}, max_folder_bytes {max_folder_bytes}"
             )
         self.path = Path(path)
@@ -77,11 +77,11 @@ class Recorder(Closeable):
         self._max_file_bytes, self._max_file_s, self._max_folder_bytes = max_file_bytes, max_file_s, max_folder_bytes
         self._buffer: deque[DecisionRecord | OutcomeRecord] = deque()
         self._room = BUFFER_RECORDS
-        self._held = 0  # in the buffer; of a batch each row
+        self._held = 0  # in the buffer; each row of a batch counts
         self._lock = threading.Lock()
         self._policies: dict[tuple[str, ...], PolicyFormat] = {}
         self.dropped = 0
-        """Records that did not fit into the buffer, or came after recording had ended."""
+        """Records that did not fit into the buffer, or came after the end of the recording."""
         self.written = 0
         self.failure: str | None = None
         """Reason why recording has ended, if it could not continue."""
@@ -98,7 +98,7 @@ class Recorder(Closeable):
             else:
                 self._file = LogFile(self.path)
         except FileExistsError:
-            raise UsageError(f"{self.path} exists: a recording is a new file, or a folder") from None
+            raise UsageError(f"{self.path} exists: expected a new file, or a folder") from None
         except OSError as error:
             raise UsageError(f"nothing can be recorded at {self.path}: {error.strerror or error}") from error
         self._closing = threading.Event()
@@ -109,14 +109,14 @@ class Recorder(Closeable):
     def policy(
         self, contract: Contract, *, graph_hash: str = "", options: Mapping[str, Any] | None = None
     ) -> PolicyFormat:
-        """Return the format of a policy's records; the same one for the same policy."""
+        """Return the format of a policy's records, the same object for the same policy."""
         made = PolicyFormat(contract, graph_hash=graph_hash, options=options)
         made = self._policies.setdefault(made.key, made)
         self._room = min(self._room, max(64, BUFFER_BYTES // made.record_bytes))
         return made
 
     def record(self, record: DecisionRecord | OutcomeRecord) -> bool:
-        """Take a record; return whether there was room for it."""
+        """Put a record into the buffer; return whether there was room for it."""
         while self._wait and self._held >= self._room and self._thread.is_alive():
             time.sleep(0.001)
         with self._lock:
@@ -130,7 +130,7 @@ class Recorder(Closeable):
     def close(self) -> None:
         """Write the buffer and end the file."""
         atexit.unregister(self.close)
-        with self._lock:  # later records are dropped, so that it ends
+        with self._lock:  # later records are dropped, so that the writer ends
             self._closing.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(WAIT_S)
@@ -150,11 +150,11 @@ class Recorder(Closeable):
                     break
             if self._file is not None:
                 self._file.close()
-        except Exception as error:  # a full disk, a folder that went away: acting continues
+        except Exception as error:  # a full disk or a removed folder: acting continues
             self._end(error)
 
     def _drain(self) -> None:
-        """Write the buffer's content at the call."""
+        """Write the buffer's present content."""
         for _ in range(len(self._buffer)):
             with self._lock:
                 record = self._buffer.popleft()
@@ -168,7 +168,7 @@ class Recorder(Closeable):
                 self.written += record.rows
             except OSError:
                 raise
-            except Exception as error:  # not of the policy's spaces
+            except Exception as error:  # does not fit the policy's spaces
                 self.dropped += record.rows
                 if not self._unreadable:
                     self._unreadable = True
@@ -197,7 +197,7 @@ class Recorder(Closeable):
             self._files += 1
             try:
                 self._file = LogFile(self.path / f"rlservo-{self._began}-{self._files:06d}{SUFFIX}")
-            except FileExistsError:  # of another recorder in this process
+            except FileExistsError:  # from another recorder in this process
                 continue
             _delete_oldest(self.path, self._max_folder_bytes - self._max_file_bytes)
             return self._file
@@ -214,13 +214,13 @@ class Recorder(Closeable):
 
 
 def _delete_oldest(folder: Path, limit: int) -> None:
-    """Delete the oldest recordings in a folder until the rest has at most `limit` bytes; never one being written."""
+    """Delete the oldest recordings in a folder until at most `limit` bytes remain, but never one being written."""
     found: list[tuple[float, int, Path]] = []
     for path in folder.iterdir():
         if FILE_NAME.match(path.name):
             try:
                 facts = path.lstat()
-            except FileNotFoundError:  # another writer of the folder was faster
+            except FileNotFoundError:  # another writer of the folder deleted it first
                 continue
             found.append((facts.st_mtime, facts.st_size, path))
     total = sum(size for _, size, _ in found)

@@ -1,7 +1,7 @@
 """Records: one decision of a policy, and its outcome.
 
-A record is made on the hot path, so it holds only present objects; everything else is the writer thread's work. The
-arrays in it must not change any more: a caller that may overwrite them later passes copies.
+A record is made on the hot path, so it holds only existing objects; the writer thread does everything else. The arrays
+in it must not change: a caller that may overwrite them later passes copies.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 
 
-@dataclass(slots=True, eq=False)  # not frozen: that triples the time of making one
+@dataclass(slots=True, eq=False)  # not frozen, which would triple the time to make one
 class DecisionRecord:
     """An observation and the action sent for it, or the reason for a missing one."""
 
     policy: PolicyFormat
     obs: Observation | LeafArrays
-    """As the policy got it; a batch is recorded as one decision per row."""
+    """The policy's input; a batch is recorded as one decision per row."""
     action: Any
-    """As it was sent, in the action space's own form; None if there was none."""
+    """The action as sent, in the action space's own form; None if there was none."""
     episode: str = ""
-    """Session, stream or loop; empty if unknown. Row i of a batch is episode `<episode>.<i>`."""
+    """Session, stream or loop; empty if unknown. Row i of a batch belongs to episode `<episode>.<i>`."""
     step: int = 0
     """Number of the decision in the episode, from 0."""
     latency_ms: float | None = None
@@ -39,41 +39,41 @@ class DecisionRecord:
     reward_input: Any = None
     """The policy's reward input."""
     last_action_input: Any = None
-    """The action that a limit on the step counted from, if the client gave it."""
+    """The action from which a step limit counted, if the client sent it."""
     seq: int | None = None
     request_id: str | None = None
     warnings: Sequence[str] = ()
     error: str | None = None
-    """The error code instead of an action: deadline-passed, unavailable, bad-observation ..."""
+    """The error code if there was no action: deadline-passed, unavailable, bad-observation ..."""
     commanded: Any = None
     """Command to the robot instead, in the action space's own form."""
     rows: int = 1
-    """Number of decisions in it."""
+    """Number of decisions in the record."""
     wall_ns: int = field(default_factory=time.time_ns)
     monotonic_ns: int = field(default_factory=time.monotonic_ns)
 
 
 @dataclass(slots=True, eq=False)
 class OutcomeRecord:
-    """Outcome of a decision, known later than the action."""
+    """Outcome of a decision, known after the action."""
 
     policy: PolicyFormat
     episode: str
     step: int
     reward: Any = None
-    """A number; of a batch one for each row, or one for all."""
+    """A number; for a batch one per row, or one for all."""
     terminated: bool = False
     truncated: bool = False
     final_status: str | None = None
     final_obs: Observation | LeafArrays | None = None
-    """The observation after an episode's last action, which is in no decision."""
+    """The observation after an episode's last action, which belongs to no decision."""
     commanded: Any = None
     """Command to the robot instead of the action."""
     robot: Mapping[str, Any] | None = None
-    """State of a real robot, its changes, and the limits that applied."""
+    """State of a real robot, its changes, and the limits that were applied."""
     may_teach: bool = True
-    """Whether the key that reported it may explore: nothing is learned from what another key says."""
+    """Whether the key that reported it may explore: reports with other keys are never learned from."""
     rows: int = 1
-    """Of the decision."""
+    """Number of the decision's rows."""
     wall_ns: int = field(default_factory=time.time_ns)
     monotonic_ns: int = field(default_factory=time.monotonic_ns)

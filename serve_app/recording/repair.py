@@ -1,4 +1,4 @@
-"""A recording without an end, or damaged, copied to its last whole chunk into a file with an end and an index."""
+"""Repair of a recording without an end, or a damaged one: a copy to its last whole chunk, with end and index."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rlservo.serve_app.recording.reader import FileFacts, read_records
 
 
 def repair_recording(path: Path, out: Path) -> FileFacts:
-    """Write the new file `out` and return the result of reading `path`, which is not changed.
+    """Write the new file `out` and return the facts about `path`, which is not changed.
 
-    Any MCAP file can be copied so, another program's as well. Raises UsageError and RecordingError.
+    Any MCAP file can be repaired, also one by another program. Raises UsageError and RecordingError.
     """
     facts = FileFacts(path)
     with new_path(out) as part, os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as stream:

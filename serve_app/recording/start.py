@@ -1,4 +1,4 @@
-"""Start of a recording in code that does not need its packages otherwise."""
+"""Start of a recording in code that otherwise does not need the recording packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Summary of a recording: policies, episodes, times, and what is missing."""
+"""Summary of a recording: policies, episodes, times and missing records."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class PolicySummary:
     gaps: int = 0
     """Episodes in which decisions are missing."""
     return_mean: float | None = None
-    """Over the episodes that ended and whose rewards are all known."""
+    """Over the finished episodes whose rewards are all known."""
     latency_p50_ms: float | None = None
     latency_p99_ms: float | None = None
     first_s: float = float("inf")

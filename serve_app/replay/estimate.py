@@ -2,7 +2,7 @@
 
 If the recorded actions explored, with known log-probabilities, episodes are weighted by how much likelier the bundle
 makes them (per-decision importance sampling: Precup, Sutton, Singh 2000). If they did not, a model of the action's
-value is fitted (`fitted_q.py`). Each estimate says whether the recordings can support it, and why not.
+value is fitted (`fitted_q.py`). Each estimate states whether the recordings can support it, and if not, why.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.replay.fitted_q import fitted_q
 from rlservo.serve_app.replay.follower import FollowedEpisode, Follower
 
-LARGEST = 5_000_000  # numbers in one matrix of episodes by steps
+LARGEST = 5_000_000  # numbers in one episodes-by-steps matrix
 RESAMPLES = 1000
 CONFIDENCE = 0.95
-FEWEST_EPISODES = 600  # of 400, an ending of six in a thousand is too often in none
+FEWEST_EPISODES = 600  # with 400, an ending of six in a thousand is too often missing
 FEWEST_FITTED = 30
 SMALLEST_SHARE = 0.5  # of effective episodes; below it the intervals miss the truth too often
 
@@ -38,10 +38,10 @@ class Estimate:
     value: float
     interval: tuple[float, float]
     effective_samples: float
-    """Number of the bundle's own episodes with as much information."""
+    """Number of the bundle's own episodes that would hold as much information."""
     supported: bool
     reason: str
-    """Reason why the interval holds, or why the recordings cannot support it."""
+    """Reason why the interval is valid, or why the recordings cannot support it."""
 
 
 @dataclass
@@ -50,15 +50,15 @@ class EstimateReport:
 
     bundle: str
     target: str
-    """The bundle's policy: 'deterministic', as it is served by default, or 'exploring'."""
+    """The bundle's policy: 'deterministic', as served by default, or 'exploring'."""
     policies: list[str] = field(default_factory=list)
     gamma: float = 1.0
     episodes: int = 0
     recorded_return: float | None = None
-    """Mean over the episodes that were used."""
+    """Mean over the used episodes."""
     recorded_interval: tuple[float, float] | None = None
     not_used: dict[str, int] = field(default_factory=dict)
-    """Episodes that could not be used, by the reason."""
+    """Unusable episodes, by reason."""
     estimates: list[Estimate] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
@@ -68,7 +68,7 @@ class EstimateReport:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One episode, as an estimate needs it."""
+    """One episode in the form that an estimate needs."""
 
     rewards: NDArray[np.float64]
     log_weights: NDArray[np.float64] | None
@@ -78,7 +78,7 @@ class Trajectory:
     actions: NDArray[np.float32]
     """`[steps, m]`, choices one-hot."""
     chosen: NDArray[np.float32]
-    """The same of the bundle's deterministic actions."""
+    """The same for the bundle's deterministic actions."""
 
 
 def estimate(
@@ -91,7 +91,7 @@ def estimate(
     seed: int = 0,
     progress: Callable[[str], object] = lambda _: None,
 ) -> EstimateReport:
-    """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploring one.
+    """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploring policy.
 
     `progress` gets the current activity. Raises OtherContractError if the recording does not fit the bundle, and
     UsageError if no episode can be used.
@@ -121,7 +121,7 @@ def estimate(
     longest = max(len(one.rewards) for one in trajectories)
     if longest * len(trajectories) > LARGEST:
         kept = max(1, LARGEST // longest)
-        report.not_used["beyond what fits into memory"] = len(trajectories) - kept
+        report.not_used["too large for the memory"] = len(trajectories) - kept
         trajectories = trajectories[-kept:]
     rng = np.random.default_rng(seed)
     returns = np.array([_discounted(one.rewards, gamma) for one in trajectories])
@@ -152,15 +152,15 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
         steps = len(one.rewards)
         total = np.cumsum(one.log_weights)
         weights[row, :steps] = np.exp(np.minimum(total, 700.0))
-        weights[row, steps:] = weights[row, steps - 1]  # the episode is over: it weighs what it did at its end
+        weights[row, steps:] = weights[row, steps - 1]  # the episode is over: it keeps its final weight
         earned[row, :steps] = one.rewards
     discounted = weights * earned * discounts
     final = weights[:, -1]
     squares = float((final**2).sum())
     effective = float(final.sum()) ** 2 / squares if squares > 0 else 0.0
 
-    # The worst and the best episode are drawn from twice: of an ending that came k times the resamples then have k + 1
-    # in the mean, whose upper quantile is about the exact (Clopper, Pearson 1934) limit. A bootstrap's own is too low.
+    # The worst and the best episode are drawn twice as often: an ending that occurred k times then occurs k + 1 times
+    # on average, whose upper quantile is about the exact limit (Clopper, Pearson 1934). A bootstrap's is too low.
     chances = np.ones(len(trajectories))
     returns = earned.sum(axis=1)
     chances[[int(np.argmin(returns)), int(np.argmax(returns))]] = 2
@@ -170,7 +170,7 @@ def importance_sampling(trajectories: list[Trajectory], gamma: float, rng: np.ra
         resampled = np.nan_to_num(numerators / denominators).sum(axis=1)
         weighted = float(np.nan_to_num(discounted.sum(axis=0) / weights.sum(axis=0)).sum())
     plain = discounted.sum(axis=1)
-    # A few heavy weights make a bootstrap too sure of itself: measured, this much wider covers.
+    # A few heavy weights make a bootstrap overconfident: widened by this measured factor, it covers the truth.
     wider = float(np.sqrt(len(trajectories) / effective)) if effective > 0 else 1.0
     supported, reason = _support(len(trajectories), effective)
     return [
@@ -198,7 +198,7 @@ def _support(episodes: int, effective: float) -> tuple[bool, str]:
         return False, f"{episodes} episodes are too few: at least {FEWEST_EPISODES} are needed"
     if effective < SMALLEST_SHARE * episodes:
         return False, (
-            f"the bundle acts too differently from what was recorded: {episodes} episodes are worth as much as "
+            f"the bundle acts too differently from the recorded policy: {episodes} episodes are worth as much as "
             f"{effective:.1f} of its own, and {SMALLEST_SHARE * episodes:.0f} are needed"
         )
     return True, (
@@ -220,7 +220,7 @@ def fitted_estimate(trajectories: list[Trajectory], gamma: float, rng: np.random
         len(trajectories) * fit.inside,
         reason is None,
         reason
-        or f"the fitted value gives the recorded return again, and {fit.inside:.0%} of the bundle's actions "
+        or f"the fitted value reproduces the recorded return, and {fit.inside:.0%} of the bundle's actions "
         "are like recorded ones",
     )
 
@@ -250,7 +250,7 @@ def _trajectory(followed: FollowedEpisode, contract: Contract, explore: bool) ->
 
 
 def _log_weights(followed: FollowedEpisode, contract: Contract, explore: bool) -> NDArray[np.float64] | None:
-    """Return the log of each action's probability under the bundle over that under the recorded policy."""
+    """Return the log of each action's probability ratio: under the bundle over under the recorded policy."""
     episode = followed.episode
     if not np.isfinite(episode.logp).all():
         return None
@@ -260,7 +260,7 @@ def _log_weights(followed: FollowedEpisode, contract: Contract, explore: bool) -
         return None if likelier is None else likelier - episode.logp
     leaves = leaf_specs(contract.action_space, "action")
     if any(leaf.kind == "box" for leaf in leaves.values()):
-        return None  # a single action has no probability in a continuum
+        return None  # in a continuum a single action has no probability
     same = np.ones(len(episode), np.bool_)
     for name, leaf in followed.action.items():
         same &= (leaf == episode.action[name]).reshape(len(episode), -1).all(axis=1)

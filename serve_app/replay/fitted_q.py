@@ -1,11 +1,11 @@
 """Fitted Q evaluation: the value of a deterministic policy from another policy's episodes (Le, Voloshin, Yue 2019).
 
 The value of an action in a state is a weighted sum of fixed features of both (and of the step, since episodes have a
-time limit), fitted by least squares to the reward and the value of what the bundle would do next, again and again, each
-time within what can be earned in the steps that are left. The same model is fitted to the recorded policy, whose return
-is known: its error there is subtracted and added to the interval. Two sets of features are fitted, and the
-interval spans both. If they disagree, if they get the recorded return wrong by much, or if the bundle's
-actions are unlike the recorded ones, nothing is claimed.
+time limit). It is fitted repeatedly by least squares to the reward plus the value of the bundle's next action, clipped
+to what the remaining steps can earn. The same model is fitted to the recorded policy, whose return is known: its error
+there is subtracted and added to the interval. Two sets of features are fitted, and the interval spans both. If they
+disagree, miss the recorded return by much, or if the bundle's actions are unlike the recorded ones, no estimate is
+given.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 LARGEST_BASIS = 200
-WAVES = 150  # random Fourier features (Rahimi, Recht 2007), where squares and products would be too many
+WAVES = 150  # random Fourier features (Rahimi, Recht 2007), if squares and products would be too many
 RIDGE = 1e-3  # relative to the features' own scale
 RESAMPLES = 30
-SETTLED = 1e-4  # of the values' scale: fitting ends when they move by less
+SETTLED = 1e-4  # of the values' scale: fitting ends when they change by less
 MOST_ROWS = 6_000
-FARTHEST = 0.05  # the share of the bundle's actions that may be unlike recorded ones
+FARTHEST = 0.05  # allowed share of the bundle's actions that are unlike recorded ones
 FARTHEST_MODELS = 0.25  # of the recorded returns' deviation, between two models' estimates
 FARTHEST_RETURN = 2.0  # of the recorded returns' deviation, from their mean to the estimate
-WIDER = 1.5  # than the bootstrap's spread, which knows of no model's error: chosen in one small world
+WIDER = 1.5  # than the bootstrap's spread, which ignores model errors: chosen in one small simulation
 LARGEST_ERROR = 4.0  # of the recorded policy's fitted return, in its standard errors
 
 Episode = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
@@ -35,7 +35,7 @@ Basis = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Fit:
-    """The bundle's fitted return, and its reliability."""
+    """The bundle's fitted return and its reliability."""
 
     value: float
     resampled: NDArray[np.float64]
@@ -77,10 +77,10 @@ def fitted_q(episodes: Sequence[Episode], gamma: float, rng: np.random.Generator
         samples += [resampled - wider, resampled + wider]
         inside = min(inside, _inside(phi, other))
         if wider > LARGEST_ERROR * spread / np.sqrt(len(kept)):
-            doubts.append(f"the fitted value gives the recorded return as {again:.4g}, and it was {known:.4g}")
+            doubts.append(f"the fitted recorded return is {again:.4g}instead of {known:.4g}")
     value = float(np.mean(values))
     if inside < 1 - FARTHEST:
-        doubts.append(f"{1 - inside:.0%} of the bundle's actions are unlike any that were recorded")
+        doubts.append(f"{1 - inside:.0%} of the bundle's actions are unlike any recorded action")
     if abs(values[0] - values[1]) > FARTHEST_MODELS * spread:
         doubts.append(f"two models of the value differ: {values[0]:.4g} and {values[1]:.4g}")
     if not returns.min() <= value <= returns.max() or abs(value - known) > FARTHEST_RETURN * spread:
@@ -91,7 +91,7 @@ def fitted_q(episodes: Sequence[Episode], gamma: float, rng: np.random.Generator
 
 @dataclass(frozen=True)
 class _Model:
-    """Least squares over all rows, and the rows' successors."""
+    """Least squares over all rows and their successors."""
 
     phi: NDArray[np.float64]
     other: NDArray[np.float64]
@@ -100,7 +100,7 @@ class _Model:
     first: NDArray[np.bool_]
     last: NDArray[np.bool_]
     left: NDArray[np.int64]
-    """Steps that can follow a row."""
+    """Number of steps that can follow a row."""
     gamma: float
 
     def values(self, weights: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -113,7 +113,7 @@ class _Model:
         for inverse, counts in zip(inverses, weights.T, strict=True):
             gram = (self.phi * counts[:, None]).T @ self.phi
             inverse[:] = np.linalg.inv(gram + RIDGE * np.trace(gram) / size * np.eye(size))
-        # An episode may end at any step and earn nothing from there on.
+        # An episode may end at any step and earn nothing afterwards.
         bounds = [extreme * self.left[:, None] for extreme in (min(self.rewards.min(), 0), max(self.rewards.max(), 0))]
         starts = weights[self.first] / weights[self.first].sum(axis=0)
         found = []
@@ -139,7 +139,7 @@ class _Model:
 
 
 def _within(episodes: Sequence[Episode], rows: int) -> list[Episode]:
-    """Return the newest episodes with at most this number of rows in total, at least one."""
+    """Return the newest episodes with at most this number of rows in total, but at least one episode."""
     kept: list[Episode] = []
     total = 0
     for episode in reversed(episodes):
@@ -151,7 +151,7 @@ def _within(episodes: Sequence[Episode], rows: int) -> list[Episode]:
 
 
 def _basis(rows: NDArray[np.float64], rng: np.random.Generator, *, products: bool) -> Basis:
-    """Return features of state, action and step: squares and products if those are few enough, else random waves."""
+    """Return features of state, action and step: squares and products if few enough, else random waves."""
     mean, scale = rows.mean(axis=0), rows.std(axis=0)
     varies = scale > 1e-6 * np.maximum(1.0, np.abs(mean))
     mean, scale = mean[varies], scale[varies]

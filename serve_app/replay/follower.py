@@ -1,8 +1,8 @@
 """Recorded episodes followed by another policy, decision by decision.
 
-A policy that remembers nothing computes an episode's observations at once. A batch's sums may be formed in another
-order, so that last bits differ: if the action is not the recorded one and close to it, the observation is computed
-again by itself, as it was when the robot was driven. Recurrent state and step limits start with the episode.
+A stateless policy computes an episode's observations at once. A batch may sum in another order, so that last bits
+differ: if an action is close to the recorded one but not equal, its observation is computed again on its own, as it was
+when the robot was driven. Recurrent state and step limits start with the episode.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.runtime.recurrent_state import State
 
 SHOWN_DIFFERENCES = 10
-ROUNDING = 1e-4  # relative: beyond it a difference is not a batch's last bits
+ROUNDING = 1e-4  # relative: a larger difference is not a batch's rounding
 
 
 class OtherContractError(UsageError):
-    """The recording is of a policy with other observations or actions."""
+    """The recording is of a policy with different observations or actions."""
 
 
 @dataclass(frozen=True)
 class FollowedEpisode:
-    """An episode and the bundle's decisions in it. Rows that are not `known` hold zeros."""
+    """An episode and the bundle's decisions in it. Unknown rows hold zeros."""
 
     episode: Episode
     known: NDArray[np.bool_]
-    """Whether the bundle's action is known: not without a recorded one, nor after a gap if the policy remembers."""
+    """Whether the bundle's action is known: not without a recorded one, nor after a gap if it is recurrent."""
     unsafe: NDArray[np.bool_]
     """Whether the bundle's action was outside its space."""
     action: dict[str, NDArray[Any]]
@@ -50,7 +50,7 @@ class FollowedEpisode:
 
 
 class Follower:
-    """One bundle that follows recordings."""
+    """A bundle that follows recordings."""
 
     def __init__(self, bundle: str | Path) -> None:
         """Load and prove the bundle."""
@@ -67,9 +67,9 @@ class Follower:
         return self.policy.contract
 
     def follow(self, recording: Recording, name: str | None = None) -> Iterator[FollowedEpisode]:
-        """Yield every episode of the policy `name`, of the bundle's own name by default, or of the only one.
+        """Yield every episode of the policy `name`; by default of the bundle's name, or of the only policy.
 
-        Raises OtherContractError if its observations or actions are others than the bundle's.
+        Raises OtherContractError if its observations or actions differ from the bundle's.
         """
         wanted = self.contract.name if name is None else name
         found = False
@@ -117,7 +117,7 @@ class Follower:
                     answer = policy.follow(obs, gave, before=before, last=last, reward=reward)
                 except ActionError:
                     known[row], unsafe[row] = False, True
-                    if policy.is_stateful:  # its memory is unknown then as well
+                    if policy.is_stateful:  # then its memory is unknown as well
                         known[row + 1 :] = False
                     continue
                 for name, leaf in answer.leaves.items():
@@ -136,7 +136,7 @@ class Follower:
         """Return the bundle under the options that the recorded policy had."""
         try:
             options = PolicyOptions.model_validate(recorded.options)
-        except ValidationError:  # of a newer version
+        except ValidationError:  # from a newer version
             options = PolicyOptions()
         key = options.model_dump_json(exclude_defaults=True)
         if key not in self._loaded:
@@ -159,7 +159,7 @@ class Follower:
 
 
 def _follow_at_once(policy: Policy, episode: Episode) -> FollowedEpisode | None:
-    """Follow an episode with a policy without memory; None if a row must be computed alone."""
+    """Follow an episode with a stateless policy; None if a row must be computed alone."""
     known = np.flatnonzero(episode.acted)
     action = {name: np.zeros_like(leaf) for name, leaf in episode.action.items()}
     inputs: NDArray[Any] | None = None
@@ -189,7 +189,7 @@ def _follow_at_once(policy: Policy, episode: Episode) -> FollowedEpisode | None:
 def _is_close_only(
     episode: Episode, action: dict[str, NDArray[Any]], inputs: NDArray[Any] | None, rows: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """Return the rows that differ from the recorded ones only by rounding."""
+    """Return the rows that differ from the recorded ones only by rounding errors."""
     pairs = [(leaf[rows], action[name][rows]) for name, leaf in episode.action.items()]
     explored = episode.explored[rows]
     close = np.zeros(len(rows), np.bool_)

@@ -1,4 +1,4 @@
-"""Replay: differences between recorded actions and a bundle's on the same observations."""
+"""Replay: differences between recorded actions and a bundle's actions on the same observations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WORST_MOMENTS = 10
 
 @dataclass
 class ElementDifference:
-    """Differences of one action element, over all decisions that were compared."""
+    """Differences of one action element, over all compared decisions."""
 
     name: str
     unit: str
@@ -28,7 +28,7 @@ class ElementDifference:
     """Decisions that differ by more than the tolerance."""
     largest: float = 0.0
     mean: float = 0.0
-    """Of the absolute difference."""
+    """Largest and mean absolute difference."""
 
 
 @dataclass(frozen=True)
@@ -51,22 +51,22 @@ class ReplayReport:
     policies: list[str] = field(default_factory=list)
     """The recorded policies, `name/version`."""
     same_graph: bool | None = None
-    """Whether the recorded graph is the bundle's; None if a recording does not know it."""
+    """Whether the recorded graph is the bundle's; None if a recording does not name it."""
     tolerance: float = 0.0
     episodes: int = 0
     decisions: int = 0
     compared: int = 0
     identical: int = 0
-    """Decisions whose action (if it explored, whose distribution) is the same bit for bit."""
+    """Decisions whose action (or whose distribution, if it explored) is the same bit for bit."""
     changed: int = 0
     """Decisions with an element beyond the tolerance."""
     explored: int = 0
-    """Of those compared: their distributions' parameters were compared, not the draws."""
+    """Compared decisions that explored: their distributions' parameters were compared, not the draws."""
     largest_distribution_difference: float = 0.0
     unsafe: int = 0
     """Decisions for which the bundle's action is outside its space."""
     not_compared: int = 0
-    """Without an action, after a gap in an episode of a policy that remembers, or explored with nothing to compare."""
+    """Decisions without an action, after a gap if the policy is recurrent, or explored with nothing to compare."""
     other_policies: dict[str, int] = field(default_factory=dict)
     dropped: int = 0
     """Records that the recorder had to drop."""
@@ -88,9 +88,9 @@ class ReplayReport:
 def replay(
     recording: Recording, bundle: str | Path, *, tolerance: float = 0.0, name: str | None = None
 ) -> ReplayReport:
-    """Put every recorded episode through a bundle and return the differences.
+    """Replay every recorded episode through a bundle and return the differences.
 
-    `name` picks a recorded policy if there are several; by default the one of the bundle's name. Raises
+    `name` selects a recorded policy if there are several; by default the one with the bundle's name. Raises
     OtherContractError if the recording does not fit the bundle, and UsageError if there is nothing to compare.
     """
     if not tolerance >= 0:
@@ -131,7 +131,7 @@ class _Comparison:
         self._largest: dict[str, NDArray[np.float64]] = {}
         self._compared = 0
         self._worst: list[tuple[float, int, Moment]] = []
-        self._order = itertools.count()  # no two moments are compared by anything else
+        self._order = itertools.count()  # breaks ties, as moments cannot be compared
         self._followed: FollowedEpisode | None = None
 
     def add(self, followed: FollowedEpisode) -> None:
@@ -235,7 +235,7 @@ def _same_bits(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
 def _distribution_difference(
     recorded: NDArray[np.float32], replayed: NDArray[Any]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return (mask of the equal rows, each row's largest difference); two infinities are the same."""
+    """Return (mask of the equal rows, each row's largest difference); two infinities are equal."""
     same = (recorded == replayed).all(axis=1)
     with np.errstate(invalid="ignore"):
         difference = np.abs(recorded.astype(np.float64) - replayed)

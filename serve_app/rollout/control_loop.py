@@ -1,6 +1,6 @@
-"""Control loop: drive a Gymnasium environment with a policy, report success, return and latency.
+"""Control loop: drive a Gymnasium environment with a policy; report success, return and latency.
 
-The policy is anything that acts: in process or over HTTP. gymnasium is imported when a rollout starts.
+The policy may be any object that acts, in process or over HTTP. gymnasium is imported when a rollout starts.
 """
 
 from __future__ import annotations
@@ -52,19 +52,18 @@ def rollout(
 ) -> RolloutReport:
     """Run `episodes` episodes of `env_id` with `policy` and return the report.
 
-    Episode i (from 0) is reset with seed + i, so that any one can be repeated alone; with `explore` its draws follow
-    from the same number. With rate 'real' the loop keeps the control rate on an absolute schedule, as on a robot: a
-    period that is missed is counted and skipped, never caught up in a burst. `video` receives the frames of the first
-    `video_episodes` episodes at the control rate; drawing happens inside the loop, so it counts as its time.
-    A policy behind a URL gets rewards and ends, for a server that records or promotes by success. `record` receives
-    every decision with its reward and end: a new .mcap file, a folder, or a Recorder.
-    `disturb` disturbs environment and robot (`latency=3,noise=real`; `disturbance.py` has the kinds).
-    A real robot takes a policy only if evaluations in its contract prove it under latency, or with `unproven`.
-    `on_episode` is called after each episode. Ctrl-C returns what was finished, with `interrupted` set; so does a
-    fallback (`WithFallback`) that is to stop, with `stopped`.
+    Episode i (from 0) is reset with seed + i, so that each can be repeated alone; with `explore` the same number seeds
+    its draws. With rate 'real' the loop keeps the control rate on an absolute schedule, as on a robot: a period that is
+    missed is counted and skipped, never caught up in a burst. `video` receives the frames of the first `video_episodes`
+    episodes at the control rate; rendering happens inside the loop, so its time counts. A policy on a server gets
+    rewards and episode ends, for recording and promotion by success. `record` receives every decision with its reward
+    and end: a new .mcap file, a folder, or a Recorder. `disturb` applies disturbances to environment and robot
+    (`latency=3,noise=real`; `disturbance.py` has the kinds). A real robot accepts a policy only if evaluations in its
+    contract prove it under latency, or with `unproven`. `on_episode` is called after each episode. Ctrl-C returns the
+    finished episodes, with `interrupted` set; so does the fallback 'stop' (`WithFallback`), with `stopped`.
 
     Raises UsageError when the environment cannot be made, does not fit the policy's contract or fails, and whatever
-    `policy.act` raises, with the episode and the step in front. The environment is always closed, the policy never.
+    `policy.act` raises, preceded by the episode and the step. The environment is always closed, the policy never.
     """
     if episodes < 1:
         raise UsageError(f"episodes must be 1 or more, got {episodes}")

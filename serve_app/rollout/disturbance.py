@@ -4,12 +4,12 @@
 |---|---|---|
 | latency | control cycles | an action takes effect later |
 | observation_latency | control cycles | an observation is older |
-| late | control cycles | each observation arrives up to so much later |
-| drop | share | observations that never arrive: the last one is given again |
+| late | control cycles | each observation arrives up to this much later |
+| drop | share | observations that never arrive: the last one is repeated |
 | noise | real, 2*real, or a number in each element's unit | normal noise on each element |
 | bias | the same | a constant error of each element, drawn once an episode |
 | noise.NAME, bias.NAME | a number in the element's unit | the same, of one element |
-| stuck | any, or an element's name | an element that keeps its first value |
+| stuck | any, or an element's name | an element keeps its first value |
 | payload | kg | a load the arm does not know of |
 | model | share | masses, inertias, gains, friction, velocities differ by up to this |
 | base | m | distance of the robot from its believed position |
@@ -42,7 +42,7 @@ LARGEST_OFFSET = 1.0  # [m]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Kinds and sizes, as they were written and as arguments of `DomainRandomization`."""
+    """Kinds and sizes, as written and as arguments of `DomainRandomization`."""
 
     label: str
     arguments: dict[str, Any]
@@ -78,7 +78,7 @@ def disturb_env(env: gym.Env[Any, Any], disturbance: Disturbance) -> gym.Env[Any
     """Return the environment with the disturbance. Raises DisturbanceError, naming the missing method."""
     from gymnasium.envs.registration import load_env_creator
 
-    # By name, as Gymnasium's registry has classes: driving a third-party environment needs no simulator of ours.
+    # By name, as in Gymnasium's registry: driving a third-party environment needs no simulator of ours.
     wrap: Callable[..., Any] = load_env_creator(WRAPPER)
     try:
         wrapped: gym.Env[Any, Any] = wrap(env, **disturbance.arguments)

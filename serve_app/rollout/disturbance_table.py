@@ -1,4 +1,4 @@
-"""Table of disturbances: success, return and endings of a policy under each, over the same seeds."""
+"""Table of disturbances: success, return and endings of a policy under each of them, over the same seeds."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class DisturbedRow:
     success_rate: float | None
     success_interval: tuple[float, float] | None  # 95%, Wilson
     return_mean: float
-    return_interval: tuple[float, float] | None  # 95%, of the mean, normal; None of one episode
+    return_interval: tuple[float, float] | None  # 95%, of the mean, normal; None for one episode
     length_mean: float
     endings: dict[str, int]
     step_sizes: dict[str, StepSize]
@@ -81,10 +81,10 @@ def measure_disturbances(
     env_kwargs: Mapping[str, Any] | None = None,
     progress: Callable[[str], object],
 ) -> DisturbanceTable:
-    """Drive `env_id` under each of the disturbances, and without any, over the seeds from `seed`.
+    """Drive `env_id` without disturbances and under each of them, over the seeds from `seed`.
 
-    None given are the standard ones, without those that the environment does not support; one that was given
-    and cannot be done raises UsageError. `progress` gets a line for each row and every few seconds.
+    By default the standard ones, except those that the environment does not support; a given one that is not supported
+    raises UsageError. `progress` gets a line for each row and every few seconds.
     """
     arguments = dict(env_kwargs or {})
     for text in disturbances:
@@ -139,16 +139,16 @@ def render_table(table: DisturbanceTable) -> Table:
 
 
 def check_plot(out: Path) -> None:
-    """Raise the UsageError that `plot_table` would raise after minutes of episodes: no such folder, no matplotlib."""
+    """Raise now the UsageError that `plot_table` would raise after minutes: no such folder, no matplotlib."""
     if not out.parent.is_dir():
-        raise UsageError(f"the plot's folder {str(out.parent)!r} does not exist: make it first")
+        raise UsageError(f"the plot's folder {str(out.parent)!r} does not exist: create it first")
     formats = optional_package("matplotlib.figure", "a plot").Figure().canvas.get_supported_filetypes()
     if out.suffix.removeprefix(".") not in formats:
         raise UsageError(f"the plot is {str(out)!r}: expected a name that ends in .{', .'.join(sorted(formats))}")
 
 
 def plot_table(table: DisturbanceTable, out: str | Path) -> None:
-    """Draw success (or the return, if there is none) with its interval, a line for each disturbance.
+    """Draw success (or else the return) with its interval, one line per disturbance.
 
     Raises UsageError if matplotlib is missing.
     """
@@ -219,7 +219,7 @@ def _possible(
 
 
 def _row(text: str, report: RolloutReport, seed: int) -> DisturbedRow:
-    assert report.return_mean is not None and report.length_mean is not None, "every episode was finished"
+    assert report.return_mean is not None and report.length_mean is not None, "every episode has finished"
     interval = None
     if report.return_std is not None:
         half = Z_95 * report.return_std / len(report.episodes) ** 0.5
@@ -240,7 +240,7 @@ def _row(text: str, report: RolloutReport, seed: int) -> DisturbedRow:
 
 
 class _Beat:
-    """A line of progress every few seconds."""
+    """Progress lines, one every few seconds."""
 
     def __init__(self, label: str, episodes: int, progress: Callable[[str], object]) -> None:
         self.label = label

@@ -18,7 +18,7 @@ from rlservo.serve_app.rollout.disturbance import parse_disturbance
 if TYPE_CHECKING:
     import gymnasium as gym
 
-PROVEN_SUCCESS = 0.8  # of a policy for a real robot, at the lower end of its 95% interval: at least 16 of 16 episodes
+PROVEN_SUCCESS = 0.8  # lower end of the 95% interval required on a real robot: at least 16 of 16 episodes
 
 
 def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.Env[Any, Any]:
@@ -27,7 +27,7 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
         import gymnasium as gym
     mode = {"render_mode": "rgb_array"} if render else {}
     try:
-        # Gymnasium's checker looks at every step and warns on the terminal: that is for who writes an environment.
+        # Gymnasium's checker inspects every step and warns on the terminal, which is meant for environment authors.
         return gym.make(importing_id(env_id), disable_env_checker=True, **{**arguments, **mode})
     except gym.error.UnregisteredEnv as error:
         close = difflib.get_close_matches(env_id, list(gym.registry), n=3, cutoff=0.5)
@@ -36,12 +36,12 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
     except (ModuleNotFoundError, gym.error.DependencyNotInstalled) as error:
         hint = install("sim") if env_id.startswith("rlservo/") else "install what it needs"
         raise UsageError(f"environment {env_id!r} cannot be made: {error}: {hint}") from error
-    except Exception as error:  # a constructor is anyone's code
+    except Exception as error:  # a constructor is third-party code
         raise UsageError(f"environment {env_id!r} cannot be made with {arguments}: {error}") from error
 
 
 def check_proven(contract: Contract, env: gym.Env[Any, Any]) -> None:
-    """Raise UsageError where the robot is real and no evaluation under latency shows that the policy succeeds."""
+    """Raise UsageError if the robot is real and no evaluation under latency shows that the policy succeeds."""
     if not getattr(env.unwrapped, "is_real", False):
         return
     found = [one for one in contract.evaluations if _action_latency(one.disturbance)]
@@ -55,14 +55,14 @@ def check_proven(contract: Contract, env: gym.Env[Any, Any]) -> None:
         )
         why = f"succeeded too rarely, or in too few episodes, under latency ({rows})"
     raise UsageError(
-        f"policy '{contract.name}' version {contract.version} {why}: a real robot takes one whose 95% interval of "
+        f"policy '{contract.name}' version {contract.version} {why}: a real robot needs one whose 95% interval of "
         f"success begins at {PROVEN_SUCCESS:.0%} or above. Measure the robot with `rlservo robot-latency`, evaluate "
         "with the `rlservo verify --disturb ... --write` that it prints, or pass --unproven"
     )
 
 
 def _action_latency(disturbance: str | None) -> int:
-    """Return the control cycles by which actions were late in every episode of an evaluation."""
+    """Return the control cycles by which actions were late in all episodes of an evaluation."""
     if disturbance is None or "latency=" not in disturbance:
         return 0
     lowest: int = parse_disturbance(disturbance).arguments.get("action_latency", (0, 0))[0]
@@ -72,7 +72,7 @@ def _action_latency(disturbance: str | None) -> int:
 def control_rate_of(env: gym.Env[Any, Any], arguments: Mapping[str, Any], contract: Contract) -> float | None:
     """Return the rate at which actions are due [Hz]: the environment's own, else the contract's, else render_fps.
 
-    `render_fps` comes last because in Gymnasium's own environments it is a wish about videos (Pendulum: 30 at 20 Hz).
+    `render_fps` comes last because Gymnasium's own environments mean it for videos (Pendulum: 30 at 20 Hz).
     """
     described_hz = _description(env, arguments).get("control_rate_hz")
     for candidate in (described_hz, contract.control_rate_hz, env.unwrapped.metadata.get("render_fps")):
@@ -82,10 +82,10 @@ def control_rate_of(env: gym.Env[Any, Any], arguments: Mapping[str, Any], contra
 
 
 def check_fit(contract: Contract, env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> None:
-    """Raise UsageError, naming the first difference, unless the policy's spaces are the environment's.
+    """Raise UsageError, which names the first difference, unless the policy's spaces are the environment's.
 
-    The observation must have the same shape, kind of number and, where both name them, elements; the action the same
-    bounds as well, since the policy scales to them.
+    The observation must have the same shape, kind of number and, if both name them, elements; the action also the same
+    bounds, since the policy scales to them.
     """
     description = _description(env, arguments)
     sides = (
@@ -128,7 +128,7 @@ def _difference(expected: SpaceSpec, actual: gym.Space[Any], *, bounds: bool) ->
         return f"is a {type(actual).__name__} there, the policy has a Box of shape {expected.shape}"
     if actual.shape != expected.shape:
         return f"has shape {actual.shape} there, the policy has {expected.shape}"
-    if np.dtype(actual.dtype).kind != np.dtype(expected.dtype).kind:  # float32 and float64 convert without harm
+    if np.dtype(actual.dtype).kind != np.dtype(expected.dtype).kind:  # float32 and float64 convert safely
         return f"has dtype {actual.dtype} there, the policy has {expected.dtype}"
     if not bounds:
         return None
@@ -176,6 +176,6 @@ def _description(env: gym.Env[Any, Any], arguments: Mapping[str, Any]) -> Mappin
         return {}
     try:
         description = describe(**arguments)
-    except TypeError:  # someone else's method of that name
+    except TypeError:  # an unrelated method of that name
         return {}
     return description if isinstance(description, Mapping) else {}

@@ -1,4 +1,4 @@
-"""One episode of a policy in a Gymnasium environment: the loop of `rollout` and of `rlservo verify`.
+"""One episode of a policy in a Gymnasium environment: the loop of `rollout` and `rlservo verify`.
 
 ```python
 for index in range(20):
@@ -54,10 +54,10 @@ def run_episode(
 ) -> Episode:
     """Run one episode: reset both, then observe, act and step until the environment ends it.
 
-    The environment is reset with `seed`; with `explore` the draws of the actions follow from it as well. `index` only
-    names the episode, in the result and in errors.
+    The environment is reset with `seed`; with `explore` it also seeds the draws of actions. `index` only names the
+    episode, in the result and in errors.
 
-    Raises UsageError when the environment fails, and whatever `policy.act` raises with the episode and step in front.
+    Raises UsageError when the environment fails, and whatever `policy.act` raises, preceded by episode and step.
     """
     has_reward = any(tensor.name == REWARD for tensor in policy.contract.inputs)
     draws = np.random.default_rng(seed)  # one seed per exploring action; unused otherwise
@@ -94,14 +94,14 @@ def _call(method: Callable[..., Any], index: int, step: int, *arguments: Any, **
     except UsageError as error:
         error.prefix(f"episode {index}, step {step}")
         raise
-    except Exception as error:  # an environment is anyone's code
+    except Exception as error:  # an environment is third-party code
         raise UsageError(
             f"episode {index}, step {step}: the environment failed with {type(error).__name__}: {error}"
         ) from error
 
 
 def _command(action: Any) -> Any:
-    """Return the action with plain numbers for choices, which is what most environments take; also in nested parts."""
+    """Return the action with plain numbers for choices, also in nested parts: most environments expect them."""
     if isinstance(action, dict):
         return {key: _command(part) for key, part in action.items()}
     if isinstance(action, tuple):

@@ -1,8 +1,8 @@
 """Fallback actions for a late or unreachable policy server.
 
-It wraps anything that acts. A control loop that raised because a packet got lost would leave the robot with its last
-command and no one in control. Which command is safe depends on the robot: holding a position setpoint stops
-an arm, holding a velocity runs a vehicle into a wall. So there is no default.
+It wraps any object that acts. A control loop that failed because of a lost packet would leave the robot with its last
+command and without control. Which command is safe depends on the robot: holding a position setpoint stops an arm,
+holding a velocity drives a vehicle into a wall. So there is no default.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from rlservo.serve_app.interface import ActingPolicy, Observation
 logger = logging.getLogger(__name__)
 
 LOG_EVERY_S = 10.0
-FIRST_TRIES = 10  # to get an episode's first action, if there is none to hold yet
+FIRST_TRIES = 10  # attempts for an episode's first action, while there is none to hold
 
 
 class StoppedError(RlservoError):
-    """The policy did not answer, and the fallback is to stop."""
+    """The policy did not answer, and the fallback is 'stop'."""
 
     code = "stopped"
 
@@ -47,13 +47,13 @@ class LinkCounts:
     """Counts of late, failed and replaced actions."""
 
     late: int = 0  # no answer within the deadline
-    unavailable: int = 0  # the server could not be reached, or refused for now
-    lost: int = 0  # the server has no memory of the episode any more
+    unavailable: int = 0  # the server could not be reached, or refused temporarily
+    lost: int = 0  # the server has lost the episode's memory
     fallback: int = 0  # steps that got the fallback's action
 
 
 class WithFallback(ActingPolicy):
-    """A policy that always has an action in time, as long as the wrapped policy keeps its deadline.
+    """A policy that always gives an action in time, as long as the wrapped policy keeps its deadline.
 
     ```python
     policy = WithFallback(StreamClient(url, "ur5", deadline_ms=50), "hold")
@@ -67,7 +67,7 @@ class WithFallback(ActingPolicy):
         *,
         on_fallback: Callable[[RlservoError], None] | None = None,
     ) -> None:
-        """`fallback`: 'hold' repeats the last action, 'zero' sends zeros, 'stop' raises StoppedError, or an action.
+        """`fallback`: 'hold' repeats the last action, 'zero' sends zeros, 'stop' raises StoppedError; or an action.
 
         `on_fallback` gets the reason each time. Raises UsageError if the action does not fit the policy's space.
         """
@@ -85,7 +85,7 @@ class WithFallback(ActingPolicy):
         self._logged_at = -LOG_EVERY_S
         self.counts = LinkCounts()
         self.failure: RlservoError | None = None
-        """Reason why the last action is the fallback's; None if the policy gave it."""
+        """Reason for the fallback in the last step; None if the policy gave the action."""
 
     @property
     def name(self) -> str:
@@ -106,10 +106,10 @@ class WithFallback(ActingPolicy):
     ) -> Any:
         """Return the policy's action, or the fallback's when it did not answer in time or at all.
 
-        If there is nothing to hold yet, an episode's first action is asked for several times.
+        If there is nothing to hold yet, an episode's first action is requested several times.
 
-        Raises StoppedError if the fallback is to stop, or to hold before there was an action, and all that is not a
-        matter of waiting: a wrong observation, an unsafe action.
+        Raises StoppedError if the fallback is 'stop', or 'hold' before there was an action, and errors that waiting
+        cannot cure: a wrong observation, an unsafe action.
         """
         more: dict[str, Any] = {} if reward is None else {"reward": reward}
         for tries_left in reversed(range(FIRST_TRIES)):
@@ -123,19 +123,19 @@ class WithFallback(ActingPolicy):
                     and not isinstance(error, SessionLostError)
                 ):
                     self._count(error)
-                    continue  # the robot has not been commanded yet, and what it sees has not changed
+                    continue  # the robot has not been commanded yet, so its observation is still valid
                 return self._fall_back(error)
-            self._last, self.failure = deepcopy(action), None  # a loop may write into what it got
+            self._last, self.failure = deepcopy(action), None  # the loop may overwrite the action that it got
             return action
         raise AssertionError("the last try returns or raises")
 
     def reset(self) -> None:
-        """Start an episode. There is nothing to hold until the policy has acted in it."""
+        """Start an episode. There is nothing to hold before the policy's first action in it."""
         self._last = None
         self._policy.reset()
 
     def outcome(self, reward: float | None = None, **brought: Any) -> None:
-        """Pass the last action's outcome on to a policy that takes it (`RemotePolicy.outcome`)."""
+        """Pass the last action's outcome on to a policy that accepts it (`RemotePolicy.outcome`)."""
         pass_on = getattr(self._policy, "outcome", None)
         if pass_on is not None:
             pass_on(reward, **brought)
@@ -157,7 +157,7 @@ class WithFallback(ActingPolicy):
         if now - self._logged_at >= LOG_EVERY_S:
             self._logged_at = now
             logger.warning("fallback (%s), %d times so far: %s", self.name, self.counts.fallback, error.message)
-        if isinstance(self._policy, LastActionPolicy):  # a limit on the step counts from what the robot really does
+        if isinstance(self._policy, LastActionPolicy):  # a limit on the step counts from the robot's actual command
             self._policy.set_last_action(deepcopy(action))
         return deepcopy(action)
 
@@ -177,7 +177,7 @@ class WithFallback(ActingPolicy):
 
 @runtime_checkable
 class LastActionPolicy(Protocol):
-    """A client whose server may remember the last action."""
+    """A client whose server may keep the last action."""
 
     def set_last_action(self, action: Any) -> None: ...
 
@@ -194,7 +194,7 @@ def _zero(contract: Contract) -> Any:
 
 
 def _parse_action(contract: Contract, action: Any) -> Any:
-    """Return a given action in the space's form; raise UsageError if it is not one."""
+    """Return a given action in the space's form. Raises UsageError if it is not an action of the space."""
     space: SpaceSpec = contract.action_space
     leaves: dict[str, Any] = {}
     try:

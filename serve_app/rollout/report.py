@@ -26,7 +26,7 @@ class EpisodeRow(Episode):
 
 @dataclass(frozen=True)
 class Latency:
-    """Time spent in `act`, over every step of the run, unfinished episodes included [ms]."""
+    """Time spent in `act`, over all steps of the run including unfinished episodes [ms]."""
 
     p50: float
     p95: float
@@ -36,11 +36,11 @@ class Latency:
 
 @dataclass(frozen=True)
 class Link:
-    """Counts of the connection to the policy, over every step of the run."""
+    """Counts of the connection to the policy, over all steps of the run."""
 
-    fallback: str | None  # the choice for a missing answer
+    fallback: str | None  # the action for a missing answer
     late: int  # no answer within the deadline
-    unavailable: int  # no connection, or a server that refused for now
+    unavailable: int  # no connection, or a server that refused temporarily
     lost: int  # the server had lost the episode's memory
     fallback_steps: int  # steps that got the fallback's action
     stale: int  # answers that came after their deadline and were dropped
@@ -49,7 +49,7 @@ class Link:
 
 @dataclass(frozen=True)
 class RolloutReport:
-    """A run of several episodes. Figures of episodes count finished ones; None means there is nothing to count."""
+    """A run of several episodes. Episode figures only count finished ones; None means that there were none."""
 
     env_id: str
     policy: str
@@ -72,14 +72,14 @@ class RolloutReport:
     latency_ms: Latency | None
     control_rate_hz: float | None
     deadline_ms: float | None  # one control period
-    deadline_misses: int | None  # steps whose `act` alone took longer than that
+    deadline_misses: int | None  # steps in which `act` alone took longer than that
     overruns: int | None  # rate 'real': steps after which the loop was late for the next one
     video: str | None
-    link: Link | None = None  # None: nothing was between the loop and its policy
-    stopped: str | None = None  # why the loop ended before its episodes did: the fallback is 'stop'
+    link: Link | None = None  # None: the policy was in process
+    stopped: str | None = None  # why the loop ended early: the fallback is 'stop'
     disturbance: str | None = None  # the disturbance of the environment, as given
     step_sizes: dict[str, StepSize] = field(default_factory=dict)  # of "action", and of velocities by unit
-    robot: dict[str, int] | None = None  # a real robot's limits: in how many of its cycles each was kept
+    robot: dict[str, int] | None = None  # a real robot's limits: number of cycles in which each was applied
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON types."""
@@ -87,7 +87,7 @@ class RolloutReport:
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the 95% score interval of a proportion (E. B. Wilson, 1927); sound at 0% and 100%, unlike +-1.96 sigma."""
+    """Return the 95% score interval of a proportion (E. B. Wilson, 1927); valid at 0% and 100%, unlike +-1.96 sigma."""
     if not 0 <= successes <= trials or trials == 0:
         raise ValueError(f"{successes} successes of {trials} trials is not a proportion")
     p = successes / trials
@@ -145,7 +145,7 @@ def render_report(report: RolloutReport) -> Table:
             f"p50 {latency.p50:.3g}  p95 {latency.p95:.3g}  p99 {latency.p99:.3g}  max {latency.max:.3g} ms",
         )
     if report.deadline_ms is None:
-        table.add_row("deadline misses", "no control rate is known")
+        table.add_row("deadline misses", "no control rate known")
     else:
         table.add_row(
             "deadline misses",

@@ -38,8 +38,7 @@ class _Steps:
 class MeasuredEnv:
     """An environment that measures the steps of its actions and of the commanded velocities.
 
-    An action of choices has none. Velocities are of an environment with a `commanded_velocity` by unit, and begin
-    with a robot at rest.
+    Discrete actions have none. Velocities come from an environment's `commanded_velocity` by unit, and start from rest.
     """
 
     env: EpisodeEnv
@@ -63,7 +62,7 @@ class MeasuredEnv:
         return result
 
     def sizes(self) -> dict[str, StepSize]:
-        """Return the sizes of the action's steps under "action", of the velocities' under their units."""
+        """Return the step sizes of the action under "action", and of the velocities under their units."""
         order = sorted(self._steps, key=lambda what: (what != ACTION, what))
         return {
             what: StepSize(self._steps[what].total / self._steps[what].count, self._steps[what].largest)

@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 
 class VideoFile(Closeable):
-    """An mp4 file that grows frame by frame; nothing is created before the first one. A context manager."""
+    """An mp4 file that grows frame by frame, created with the first one. A context manager."""
 
     def __init__(self, path: str | Path, *, fps: float) -> None:
-        """Check the name and that the encoder is installed, so that a long run does not fail at its first frame."""
+        """Check the name and the encoder's installation, so that a long run does not fail at its first frame."""
         self.path = Path(path)
         if self.path.suffix.lower() != ".mp4":
             raise UsageError(f"the video file is {str(path)!r}: expected a name that ends in .mp4")
         if not self.path.parent.is_dir():
-            raise UsageError(f"the video file's folder {str(self.path.parent)!r} does not exist: make it first")
+            raise UsageError(f"the video file's folder {str(self.path.parent)!r} does not exist: create it first")
         with needs_extra("sim", what="a video"):
             for module in ("imageio.v2", "imageio_ffmpeg"):
                 import_module(module)
@@ -53,7 +53,7 @@ class VideoFile(Closeable):
 
 
 class FilmedEnv:
-    """An environment that gives `add` its picture after each reset and step, or after `steps` alone (0: the reset)."""
+    """An environment that passes `add` its picture after each reset and step, or only after `steps` (0: the reset)."""
 
     def __init__(
         self, env: gym.Env[Any, Any], add: Callable[[NDArray[np.uint8]], object], steps: Collection[int] | None = None

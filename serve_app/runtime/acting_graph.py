@@ -1,7 +1,7 @@
 """Graph without the value head, which no action needs.
 
-onnxruntime computes every output of a graph, requested or not. A value head is as large as the rest, and its
-weights displace the rest from the processor's cache: of an action from two hidden layers of 256 it was a third.
+onnxruntime computes every output of a graph, requested or not. A value head is as large as the rest, and its weights
+displace the rest from the processor's cache: with two hidden layers of 256 it took a third of an action's time.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 from rlservo.export.contract.contract import VALUE
 from rlservo.serve_app.wire.protobuf_messages import build_messages
 
-# The fields of ONNX's messages (onnx.proto) that are read; the rest is passed on unchanged.
+# The fields of ONNX's messages (onnx.proto) that are read; other fields are kept unchanged.
 MESSAGES = {
     "Name": ("string name = 1",),
     "Tensor": ("string name = 8",),
@@ -43,7 +43,7 @@ def without_value(model: bytes) -> bytes:
             waiting += _inputs(makers[name]) if name in makers else ()
     _drop(graph.node, lambda node: needed.isdisjoint(node.output))
     dropped = {tensor.name for tensor in graph.initializer} - needed
-    for tensors in (graph.initializer, graph.input):  # an initializer may be listed as an input that has a default
+    for tensors in (graph.initializer, graph.input):  # an initializer may also be listed as an input with a default
         _drop(tensors, lambda tensor: tensor.name in dropped)
     serialized: bytes = message.SerializeToString()
     return serialized

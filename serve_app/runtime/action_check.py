@@ -12,7 +12,7 @@ from rlservo.export.contract.errors import ActionError
 from rlservo.export.contract.spaces import LeafSpec
 from rlservo.serve_app.runtime.input_numbers import first_element, rounding_slack
 
-SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy does
+SMALL_ACTION = 32  # elements up to which a Python loop checks bounds faster than numpy
 
 
 class ActionCheck:
@@ -24,7 +24,7 @@ class ActionCheck:
         self._space = space
         self._dtype = np.dtype(space.dtype)
         low, high = space.bounds()
-        if self._dtype.kind == "f":  # the largest finite number stands for unbounded: infinity is then outside as well
+        if self._dtype.kind == "f":  # the largest finite number stands for unbounded, so infinity is outside too
             largest = float(np.finfo(self._dtype).max)
             low, high = np.maximum(low, -largest), np.minimum(high, largest)
         self._low, self._high = low, high
@@ -33,11 +33,11 @@ class ActionCheck:
             self._small_bounds = (low.ravel().tolist(), high.ravel().tolist())
 
     def check(self, action: NDArray[Any]) -> None:
-        """Raise ActionError unless `action` `[batch, *shape]` is of the space; rounding is clipped in place."""
+        """Raise ActionError unless `action` `[batch, *shape]` is in the space; rounding errors are clipped in place."""
         if self._small_bounds is not None and len(action) == 1:
             values = action.ravel().tolist()
             low, high = self._small_bounds
-            if all(map(le, low, values)) and all(map(ge, high, values)):  # so written, it holds for not-a-number too
+            if all(map(le, low, values)) and all(map(ge, high, values)):  # written so that not-a-number fails
                 return
         elif ((action >= self._low) & (action <= self._high)).all():
             return

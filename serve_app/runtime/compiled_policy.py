@@ -1,6 +1,6 @@
-"""Policy that `rlservo compile` turned into C, in this process: the same `act`, without onnxruntime.
+"""Policy compiled to C by `rlservo compile`, in this process: the same `act`, without onnxruntime.
 
-Its folder has the shared library that was proven on this machine. A library is a program: load only your own.
+Its folder has the shared library that was proven on this machine. A library is executable code: load only your own.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from rlservo.serve_app.runtime.policy import Policy
 
 COMPILE_FILE = "compile.json"
 REFUSED = {
-    2: "an observation is not a finite number", 3: "an observation is none of its choices",
+    2: "an observation is not a finite number", 3: "an observation is not one of its choices",
     4: "the network computed an action that is not a finite number",
     5: "the network computed an action outside the action space",
 }  # fmt: skip
-"""Kinds of result codes that come without an action (`export/compiled/interface.py` writes them)."""
+"""Kinds of result codes without an action (written by `export/compiled/interface.py`)."""
 
 
 class CompiledPolicy(Policy):
@@ -40,16 +40,16 @@ class CompiledPolicy(Policy):
     action = policy.act(obs)
     ```
 
-    It acts, remembers and checks as `Policy` does, one observation after the other; it cannot explore and has no value.
+    It acts, remembers and checks as `Policy` does, one observation at a time; it cannot explore and has no value.
     """
 
     def __init__(self, path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS) -> None:
-        """Raises BundleError if the folder has no library, BundleTamperedError if it is not the one that was proven."""
+        """Load the folder's library. Raises BundleError if it has none, BundleTamperedError if it is not proven."""
         folder = Path(path)
         about = _read_about(folder)
         contract = acting_contract(read_contract(folder))
         if about.get("library") is None:
-            raise BundleError(f"{folder} has no library: it was written without a compiler ({about.get('unproven')})")
+            raise BundleError(f"{folder} has no library: it was written without a C compiler ({about.get('unproven')})")
         file = folder / str(about["library"])
         recorded = about["files"]
         for each in (file, folder / CONTRACT_FILE):
@@ -58,16 +58,16 @@ class CompiledPolicy(Policy):
             except OSError as error:
                 raise BundleError(f"{each} cannot be read: {error.strerror}") from error
             if actual != recorded.get(each.name):
-                raise BundleTamperedError(f"{each} is not the file that was proven: {COMPILE_FILE} has another hash")
+                raise BundleTamperedError(f"{each} is not the proven file: {COMPILE_FILE} has another hash")
         library = CompiledLibrary(file, about["prefix"], contract)
         if library.bundle != about["bundle"]:
-            raise BundleTamperedError(f"{file} was compiled from another bundle than the one in {COMPILE_FILE}")
+            raise BundleTamperedError(f"{file} was compiled from a different bundle than {COMPILE_FILE} names")
         bundle = Bundle(folder, contract, recorded, about["bundle"])
         super().__init__(bundle, cast(Any, library), options, graph_hash=recorded[file.name])
 
 
 def open_policy(path: str | Path, *, options: PolicyOptions = DEFAULT_OPTIONS, check_golden: bool = True) -> Policy:
-    """Return the policy of a bundle, or of a folder that `rlservo compile` wrote. Raises the errors of both."""
+    """Return the policy of a bundle, or of a folder written by `rlservo compile`. Raises the errors of both."""
     if (Path(path) / COMPILE_FILE).is_file():
         return CompiledPolicy(path, options=options)
     return Policy.load(path, options=options, check_golden=check_golden)
@@ -85,7 +85,7 @@ def _read_about(folder: Path) -> dict[str, Any]:
     try:
         about = json.loads(file.read_text(encoding="utf-8"))
         if not isinstance(about["files"], dict) or not isinstance(about["prefix"], str) or not about["bundle"]:
-            raise ValueError("it lacks what `rlservo compile` writes")
+            raise ValueError("it lacks fields that `rlservo compile` writes")
     except FileNotFoundError as error:
         raise BundleError(f"{folder} holds no compiled policy: expected {COMPILE_FILE} (`rlservo compile`)") from error
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -94,10 +94,10 @@ def _read_about(folder: Path) -> dict[str, Any]:
 
 
 class CompiledLibrary:
-    """The functions of a shared library, in the form of onnxruntime's session: `run`."""
+    """The functions of a shared library, with the interface of onnxruntime's session: `run`."""
 
     def __init__(self, file: Path, prefix: str, contract: Contract) -> None:
-        """Raises BundleError if the library cannot be loaded, or is not that of a compiled policy."""
+        """Load the library. Raises BundleError if it cannot be loaded, or is not of a compiled policy."""
         try:
             library = ctypes.CDLL(str(file.resolve()))
             self._act, self._reset, self._element = (
@@ -106,7 +106,7 @@ class CompiledLibrary:
             self.state_size = ctypes.c_size_t.in_dll(library, f"{prefix}_state_size").value
             self.bundle = ctypes.string_at(ctypes.addressof(ctypes.c_char.in_dll(library, f"{prefix}_bundle"))).decode()
         except (OSError, AttributeError, ValueError) as error:
-            raise BundleError(f"{file} is not a library of a compiled policy: {error}") from error
+            raise BundleError(f"{file} is not the library of a compiled policy: {error}") from error
         self._act.restype, self._act.argtypes = ctypes.c_int32, [ctypes.c_void_p] * 3
         self._element.restype, self._element.argtypes = ctypes.c_char_p, [ctypes.c_int32]
         self._policy = contract.name
@@ -114,7 +114,7 @@ class CompiledLibrary:
         obs = [(name, leaf.dtype, leaf.shape) for name, leaf in observed.items()]
         if any(tensor.name == REWARD for tensor in contract.inputs):
             obs.append((REWARD, "float32", ()))
-        # numpy lays structs out as C does. Of the state it has what is remembered; memory to compute in follows.
+        # numpy lays structs out as C does. The state begins with the remembered values; working memory follows.
         self._structs = (
             np.dtype(obs, align=True),
             np.dtype([(f"state_in.{state.name}", state.dtype, state.shape) for state in contract.state], align=True),
@@ -124,7 +124,7 @@ class CompiledLibrary:
         self._own = threading.local()
 
     def run(self, names: Sequence[str], feed: Mapping[str, NDArray[Any]], _options: Any = None) -> list[NDArray[Any]]:
-        """Return the named outputs `[batch, ...]`, computed row by row. Raises a refused row's error."""
+        """Return the named outputs `[batch, ...]`, computed row by row. Raises the error of a refused row."""
         codes, outputs = self.step(feed)
         for code in codes[is_refused(codes)][:1].tolist():
             kind, element = code >> 24, self._element(code).decode("utf-8", "replace")
@@ -135,7 +135,7 @@ class CompiledLibrary:
         return [outputs[name] for name in names]
 
     def step(self, feed: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int32], dict[str, NDArray[Any]]]:
-        """Return (each row's result code, every output `[batch, ...]`, which a refused row leaves at zero)."""
+        """Return (each row's result code, every output `[batch, ...]`, with zeros for a refused row)."""
         places, pointers = self._memory()
         rows = len(next(iter(feed.values())))
         codes = np.zeros(rows, np.int32)
@@ -165,5 +165,5 @@ class CompiledLibrary:
 
 
 def is_refused(code: Any) -> Any:
-    """Return whether a result code (or each of an array) comes without an action."""
+    """Return whether a result code (or each of an array) means that there is no action."""
     return code >> 24 >= min(REFUSED)

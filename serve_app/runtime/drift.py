@@ -1,9 +1,9 @@
-"""Drift of the observations a policy gets from those it was trained on.
+"""Drift of a policy's observations from those of its training.
 
 The exporter bakes RLlib's running filter into the graph and writes its mean and standard deviation into the contract;
-nothing more is needed. One observation in `EVERY` is looked at (in a batch, its first rows), and running means with a
-limited memory are kept of z = (obs - mean) / std: a policy at home shows a shift near 0 and a spread near 1 for every
-element. No observation is kept.
+nothing more is needed. One observation in `EVERY` is checked (in a batch, its first rows), and running means of z =
+(obs - mean) / std are kept with a limited memory: for familiar observations the shift is near 0 and the spread near 1
+for every element. No observation is kept.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rlservo.export.contract.spaces import BoxSpec, iter_elements
 FILTER = "mean_std_filter"
 EVERY = 16  # the arithmetic costs a few microseconds: too much for every step of a control loop
 ROWS = 64  # of a batch
-MEMORY = 512  # looks; older ones fade
+MEMORY = 512  # observations; older ones fade
 LARGEST = 100.0  # an element that never moved in training has no scale
 SMALLEST_STD = 1e-6
 
@@ -47,7 +47,7 @@ class Drift:
         return cls(tuple(labels), *moments)
 
     def add(self, obs: NDArray[Any]) -> None:
-        """Count checked observations `[batch, ...]` in; a parser does so with one call in `EVERY`."""
+        """Include checked observations `[batch, ...]`; a parser does this once in `EVERY` calls."""
         self.looks += 1
         z: NDArray[np.float64] = (obs[:ROWS].reshape(min(len(obs), ROWS), -1) - self._mean) * self._scale
         np.clip(z, -LARGEST, LARGEST, out=z)
@@ -57,7 +57,7 @@ class Drift:
 
     @property
     def shift(self) -> NDArray[np.float64]:
-        """Mean of z per element: how far the observations have moved, in standard deviations of the training."""
+        """Mean of z per element: shift of the observations, in standard deviations of the training."""
         shift: NDArray[np.float64] = self._shift.copy()
         return shift
 
@@ -69,7 +69,7 @@ class Drift:
 
 
 def training_moments(contract: Contract) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Return each observed element's mean and standard deviation in training, flat.
+    """Return the mean and standard deviation of each observation element in training, flat.
 
     None if the contract has no filter of the raw observation.
     """

@@ -1,7 +1,7 @@
 """Exploring actions: samples of the policy's action distribution, drawn in numpy as RLlib draws them.
 
-The graph gives the distribution's parameters (`action_dist_inputs`); this file knows the distributions RLlib's own
-algorithms use and what RLlib does to a sample before `env.step`.
+The graph gives the distribution's parameters (`action_dist_inputs`); this file has the distributions of RLlib's own
+algorithms and the steps that RLlib applies to a sample before `env.step`.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from rlservo.export.contract.spaces import (
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """An exploring action, and its origin for a recording."""
+    """An exploring action, with its origin for a recording."""
 
     action: dict[str, NDArray[Any]]
     """By tensor name, `[batch, *shape]`, ready for the environment."""
     own: dict[str, NDArray[Any]]
-    """The module's own action: the sample before it was unsquashed, clipped or given the space's start."""
+    """The module's own action: the sample before unsquashing, clipping and adding the space's start."""
     inputs: NDArray[Any]
     """`action_dist_inputs`, `[batch, distribution_size]`."""
 
 
 def distribution_size(distribution: Distribution, space: SpaceSpec) -> int:
-    """Return the number of values per action in `action_dist_inputs`; 0 if the two do not belong together."""
+    """Return the number of values per action in `action_dist_inputs`; 0 if distribution and space do not match."""
     leaves = leaf_specs(space, "action").values()
     kinds = {_leaf_kind(leaf, distribution) for leaf in leaves}
     nested = isinstance(space, DictSpec | TupleSpec)
@@ -55,9 +55,9 @@ def sample_action(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Draw one action per row of `inputs` `[batch, distribution_size]`: (in environment units, the module's own).
 
-    Both are `[batch, *space.shape]`. 'diag_gaussian' rows are [mean, log_std]; 'squashed_gaussian' rows are too, with
-    the sample through tanh; 'categorical' rows are logits, sampled by the Gumbel-max trick (Gumbel 1954; Maddison et
-    al. 2014, arXiv:1411.0030); 'multi_categorical' rows are several such rows side by side.
+    Both are `[batch, *space.shape]`. 'diag_gaussian' rows are [mean, log_std]; 'squashed_gaussian' rows as well, with
+    tanh of the sample; 'categorical' rows are logits, sampled by the Gumbel-max trick (Gumbel 1954; Maddison et al.
+    2014, arXiv:1411.0030); 'multi_categorical' rows are several such rows side by side.
     """
     rows = inputs.astype(np.float64)
     if isinstance(space, DiscreteSpec):

@@ -17,7 +17,7 @@ RELATIVE_SLACK = 1e-5  # of the bound, or of 1 if that is larger
 
 
 def rounding_slack(low: NDArray[Any], high: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.float64]:
-    """Return the distance by which float32 rounding may put a value of [low, high] outside; 0 for integers."""
+    """Return the distance by which float32 rounding may move a value of [low, high] outside; 0 for integers."""
     if dtype.kind != "f":
         return np.zeros(low.shape)
     slack: NDArray[np.float64] = RELATIVE_SLACK * np.maximum(1.0, np.minimum(np.abs(low), np.abs(high)))
@@ -34,7 +34,7 @@ def first_element(space: LeafSpec, bad: NDArray[np.bool_]) -> tuple[str, tuple[i
 def to_array(given: Any) -> NDArray[Any]:
     """Return numbers from nested lists as an array; integers stay exact if one dtype holds all of them.
 
-    Next to smaller ones, numpy turns an integer of 2**63 and more into a float. Raises numpy's error for lists of
+    Numpy turns an integer of 2**63 or more into a float if smaller ones are present. Raises numpy's error for lists of
     unequal length.
     """
     array = np.asarray(given)
@@ -53,15 +53,15 @@ def to_array(given: Any) -> NDArray[Any]:
 def find_unfit(array: NDArray[Any], dtype: np.dtype[Any]) -> tuple[NDArray[np.bool_], str] | None:
     """Return (mask of the numbers that an integer or bool `dtype` cannot hold, reason); None if it holds all of them.
 
-    A float so large that it stands for several integers fits none: the sender may have meant another one.
+    A float so large that it stands for several integers is unfit: the client may have meant another one.
     """
     info = np.iinfo(dtype) if dtype.kind in "iu" else None
     low, high = (int(info.min), int(info.max)) if info is not None else (0, 1)
     is_float, name = array.dtype.kind == "f", array.dtype.name
     digits = np.finfo(array.dtype).nmant + 1 if is_float else 0
     if is_float:
-        array = array.astype(np.float64)  # float16 has no numbers as large as the bounds
-    unfit = np.asarray((array < low) | (array > high))  # exact for integers; large floats are looked at below
+        array = array.astype(np.float64)  # float16 cannot represent the bounds
+    unfit = np.asarray((array < low) | (array > high))  # exact for integers; large floats are checked below
     if is_float:
         unfit |= ~np.isfinite(array) | (array != np.floor(array))
     if unfit.any():
@@ -78,7 +78,7 @@ def parse_array(
     try:
         array = to_array(given)
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise kind(f"{what} cannot be read: its lists are not of equal length") from error
+        raise kind(f"{what} cannot be read: its lists differ in length") from error
     if array.dtype.kind not in NUMBER_KINDS:
         found = first_non_number(given, ())
         value = describe(found[1]) if found is not None else f"of dtype {array.dtype}"
@@ -98,7 +98,7 @@ def first_non_number(value: Any, where: tuple[int, ...]) -> tuple[tuple[int, ...
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         if len(where) > 32:  # numpy itself stops at 64 axes
             return where, value
-        types = set(map(type, value))  # of a long list in a fraction of the time that a loop takes
+        types = set(map(type, value))  # for a long list in a fraction of a loop's time
         if types <= {bool, float} or (types <= {bool, int} and min(value) >= -(2**63) and max(value) < 2**64):
             return None
         for index, item in enumerate(value):
@@ -126,11 +126,9 @@ def describe_unequal(lists: Sequence[Any]) -> str:
     for index, one in enumerate(lists):
         found = form(one)
         if found is None or found != first:
-            shape = "has lists that are not of equal length" if found is None else f"is of shape {found}"
-            return (
-                f"its parts are not of equal length: observation {index} of the batch {shape}, the first is of {first}"
-            )
-    return "its lists are not of equal length"
+            shape = "has lists of different lengths" if found is None else f"has shape {found}"
+            return f"its parts differ in length: observation {index} of the batch {shape}, the first has {first}"
+    return "its lists differ in length"
 
 
 def describe(value: Any) -> str:
@@ -143,7 +141,7 @@ def describe(value: Any) -> str:
     if isinstance(value, Mapping):
         return "a map"
     if isinstance(value, int) and not -(2**63) <= value < 2**64:
-        return "an integer of more than 64 bits"
+        return "an integer with more than 64 bits"
     kind = type(value).__name__
     return f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}"
 

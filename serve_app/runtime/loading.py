@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 GOLDEN_RTOL = (
-    1e-4  # machines differ in the last bits of exp and in the order of sums; a wrong graph differs in the first
+    1e-4  # machines differ in the last bits of exp and in the order of sums; a wrong graph differs in the first bits
 )
 GOLDEN_ATOL = 1e-5  # the same for actions near zero
-MAX_ELEMENTS = 1 << 24  # of an observation or action: a contract of one line could ask for all the memory there is
+MAX_ELEMENTS = 1 << 24  # of an observation or action: a one-line contract could otherwise demand all memory
 # onnxruntime's names of the types a policy's tensors have.
 ONNX_TYPES = {
     "tensor(float)": "float32", "tensor(double)": "float64", "tensor(float16)": "float16", "tensor(bool)": "bool",
@@ -36,17 +36,17 @@ ONNX_TYPES = {
 }  # fmt: skip
 
 LARGEST_MADE = 32 << 20
-"""[bytes] of a graph that is rebuilt without its value head: acting waits meanwhile, 0.6 ms for each megabyte."""
+"""[bytes] Largest graph that is rebuilt without its value head; acting waits meanwhile, 0.6 ms per megabyte."""
 
 PROOF_S = 10.0
 """[s] Time limit for the golden vectors: a network computes thousands in a second, but a graph can have loops."""
 
 Run = Callable[..., Any]
-"""onnxruntime's: output names, inputs by name and, if need be, its options, to arrays."""
+"""Signature of onnxruntime's `run`: output names, inputs by name and optional run options, to arrays."""
 
 
 def check_contract(bundle: Bundle) -> None:
-    """Refuse what this runtime cannot run faithfully, and contracts that contradict themselves."""
+    """Refuse contracts that this runtime cannot run faithfully, or that contradict themselves."""
     contract = bundle.contract
     observations = leaf_specs(contract.observation_space, "obs")
     actions = leaf_specs(contract.action_space, "action")
@@ -63,12 +63,12 @@ def check_contract(bundle: Bundle) -> None:
     for side, listed_tensors in (("inputs", contract.inputs), ("outputs", contract.outputs)):
         for tensor in listed_tensors:
             space = tensors_of[side].get(tensor.name)
-            # RLlib sends the action of a Box of shape () as an array of one, and so do its exports.
+            # RLlib gives an action of a Box of shape () as an array of one element, and so do its exports.
             shapes = [(-1, *space.shape)] + [(-1, 1)] * (side == "outputs" and not space.shape) if space else []
             if space is not None and (tensor.dtype != space.dtype or tensor.shape not in shapes):
                 raise BundleError(
-                    f"{bundle.path}: the space of '{tensor.name}' is {space.dtype} of shape {space.shape}, the tensor "
-                    f"{tensor.dtype} of shape {tensor.shape}"
+                    f"{bundle.path}: the space of '{tensor.name}' is {space.dtype} of shape {space.shape}, but the "
+                    f"tensor is {tensor.dtype} of shape {tensor.shape}"
                 )
     for state in contract.state:
         shape = (-1, *state.shape)
@@ -98,7 +98,7 @@ def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
     except TypeError:
         kind = "?"
     if kind not in "fiub":
-        raise BundleError(f"{where} has dtype '{space.dtype}': expected a number type")
+        raise BundleError(f"{where} has dtype '{space.dtype}': expected a numeric type")
     if space.size > MAX_ELEMENTS:
         raise BundleError(f"{where} has {space.size:,} elements: at most {MAX_ELEMENTS:,}")
     if space.elements and len(space.elements) != space.size:
@@ -113,7 +113,7 @@ def _check_leaf(bundle: Bundle, name: str, space: LeafSpec) -> None:
 
 
 def leaves_value_out(bundle: Bundle) -> bool:
-    """Whether the acting graph leaves out its value head: if it has one, and is not large."""
+    """Return whether the acting graph leaves out its value head: if it has one, and is not large."""
     has_value = any(tensor.name == VALUE for tensor in bundle.contract.outputs)
     return has_value and bundle.onnx.stat().st_size <= LARGEST_MADE
 
@@ -129,7 +129,7 @@ def open_graph(bundle: Bundle, threads: int, *, acts_only: bool = False) -> onnx
             return open_ort_session(file, threads)
         except Exception as error:  # onnxruntime's own exceptions share no base but Exception
             sentence = first_line(error).replace(str(file), bundle.onnx.name)
-            raise BundleError(f"{bundle.onnx} is not a graph onnxruntime can run: {sentence}") from error
+            raise BundleError(f"{bundle.onnx} is not a graph that onnxruntime can run: {sentence}") from error
 
 
 def check_graph(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> None:
@@ -142,8 +142,8 @@ def check_graph(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> No
         found = {node.name: node for node in actual}
         if set(found) != {tensor.name for tensor in listed}:
             raise BundleError(
-                f"{bundle.onnx}: the graph's {side} are {', '.join(sorted(found))}, "
-                f"{CONTRACT_FILE} lists {', '.join(sorted(tensor.name for tensor in listed))}"
+                f"{bundle.onnx}: the graph's {side} are {', '.join(sorted(found))}, but {CONTRACT_FILE} lists "
+                f"{', '.join(sorted(tensor.name for tensor in listed))}"
             )
         for tensor in listed:
             actual_type = ONNX_TYPES.get(found[tensor.name].type, found[tensor.name].type)
@@ -158,7 +158,7 @@ def check_graph(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> No
             )
             if not fits:
                 raise BundleError(
-                    f"{bundle.onnx}: '{tensor.name}' has shape (batch, {', '.join(map(str, inner))}) in the graph and "
+                    f"{bundle.onnx}: '{tensor.name}' has shape (batch, {', '.join(map(str, inner))}) in the graph, but "
                     f"{tensor.shape} in {CONTRACT_FILE}"
                 )
 
@@ -167,8 +167,8 @@ def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> Non
     """Compare the contract with the copy inside the graph: an edited one may have valid hashes."""
     text = ort_session.get_modelmeta().custom_metadata_map.get(CONTRACT_KEY)
     if text is None:
-        return  # a graph that another tool wrote; the visible parts of the contract have been compared
-    exported = parse_contract(text, f"{bundle.onnx}: the contract inside it is malformed")
+        return  # a graph of another tool; the visible parts of the contract have been compared
+    exported = parse_contract(text, f"{bundle.onnx}: the contract inside the graph is malformed")
     now = bundle.contract.model_copy(update={"evaluations": exported.evaluations})  # `rlservo verify` adds to them
     if now != exported:
         changed = [name for name in Contract.model_fields if getattr(now, name) != getattr(exported, name)]
@@ -180,7 +180,7 @@ def check_copy(bundle: Bundle, ort_session: onnxruntime.InferenceSession) -> Non
 
 
 def acting_outputs(contract: Contract) -> list[str]:
-    """Return the graph's outputs but for `value`."""
+    """Return the graph's outputs except `value`."""
     return [tensor.name for tensor in contract.outputs if tensor.name != VALUE]
 
 
@@ -188,7 +188,7 @@ def check_golden_vectors(bundle: Bundle, run: Run, names: Sequence[str]) -> None
     """Replay golden.npz and compare the outputs of these names with the recorded ones.
 
     Floats agree within `max(contract parity rtol, GOLDEN_RTOL)` relative and `max(parity atol, GOLDEN_ATOL)` absolute;
-    integers exactly, unless the choice was a tie within that tolerance. Raises GoldenMismatchError.
+    integers agree exactly, unless the choice was a tie within that tolerance. Raises GoldenMismatchError.
     """
     inputs, recorded = bundle.golden()
     missing = ({tensor.name for tensor in bundle.contract.inputs} - set(inputs)) | (set(names) - set(recorded))
@@ -211,7 +211,7 @@ def check_golden_vectors(bundle: Bundle, run: Run, names: Sequence[str]) -> None
 
 
 def _run_in_time(bundle: Bundle, run: Run, names: Sequence[str], feed: dict[str, NDArray[Any]]) -> Sequence[Any]:
-    """Compute, or raise BundleError after PROOF_S: onnxruntime ends before the next operator, or turn of a loop."""
+    """Compute, or raise BundleError after PROOF_S: onnxruntime stops before the next operator or loop iteration."""
     import onnxruntime
 
     options = onnxruntime.RunOptions()
@@ -240,7 +240,7 @@ def _compare(
     got, expected = computed[name], recorded[name]
     if got.shape != expected.shape:
         raise GoldenMismatchError(
-            f"{bundle.path}: '{name}' has shape {got.shape} on this machine, {expected.shape} in {GOLDEN_FILE}"
+            f"{bundle.path}: '{name}' has shape {got.shape} on this machine, but {expected.shape} in {GOLDEN_FILE}"
         )
     difference = np.abs(got.astype(np.float64) - expected.astype(np.float64))
     within = difference <= (rtol * np.abs(expected) + atol if expected.dtype.kind == "f" else 0)
@@ -265,7 +265,7 @@ def _ties(
     rtol: float,
     atol: float,
 ) -> NDArray[np.bool_]:
-    """Return where another discrete choice is as good: its score ties with the recorded one's within tolerance."""
+    """Return where another discrete choice is equally good: its score ties with the recorded one within tolerance."""
     expected = recorded[name]
     none = np.zeros(expected.shape, np.bool_)
     scores = next((recorded[key] for key in ("action_dist_inputs", "q_values") if key in recorded), None)

@@ -1,4 +1,4 @@
-"""Observations of callers as the graph's input tensors, for any space."""
+"""Callers' observations as the graph's input tensors, for any space."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rlservo.serve_app.runtime.input_numbers import describe
 from rlservo.serve_app.runtime.observation_leaf_check import LeafParser
 from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
-MOST_NOTICES = 16  # of a list of observations: its reply carries them
+MOST_NOTICES = 16  # for a list of observations: the reply carries them
 
 
 class Observed(NamedTuple):
@@ -23,7 +23,7 @@ class Observed(NamedTuple):
 
     arrays: dict[str, NDArray[Any]]  # `[batch, ...]` by the graph's input names
     batch: bool  # whether it was given as a batch
-    notices: tuple[str, ...]  # sentences on values that are out of bounds and used nevertheless
+    notices: tuple[str, ...]  # sentences about values that are out of bounds and used anyway
 
 
 class ObservationParser:
@@ -63,7 +63,7 @@ class ObservationParser:
             parts = ", ".join(
                 f"{name} {'one' if size is None else f'a batch of {size}'}" for name, size in sizes.items()
             )
-            self._refuse("obs", f"its parts are not of one batch ({parts})")
+            self._refuse("obs", f"its parts have different batch sizes ({parts})")
         return Observed(arrays, next(iter(sizes.values())) is not None, notices)
 
     def _parse_list(self, observations: Sequence[Any]) -> Observed:
@@ -74,7 +74,7 @@ class ObservationParser:
             except ObservationError as error:
                 raise ObservationError(f"observation {index}: {error.message}", error.details) from error
             if row.batch:
-                self._refuse("obs", f"observation {index} of the list is a batch itself")
+                self._refuse("obs", f"observation {index} of the list is itself a batch")
             rows.append(row)
         arrays = {name: np.concatenate([row.arrays[name] for row in rows]) for name in self.leaves}
         return Observed(arrays, True, tuple(notice for row in rows for notice in row.notices)[:MOST_NOTICES])
@@ -96,7 +96,7 @@ class ObservationParser:
         elif isinstance(space, TupleSpec):
             if not isinstance(value, list | tuple) or len(value) != len(space.spaces):
                 got = f"{len(value)} of them" if isinstance(value, list | tuple) else describe(value)
-                self._refuse(path, f"expected a list of its {len(space.spaces)} parts, got {got}")
+                self._refuse(path, f"expected a list of {len(space.spaces)} parts, got {got}")
             for index, child in enumerate(space.spaces):
                 self._collect(child, value[index], f"{path}.{index}", leaves)
         else:

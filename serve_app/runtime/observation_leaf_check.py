@@ -1,9 +1,9 @@
-"""One array of an observation, checked: shape, dtype, finite numbers, names, bounds.
+"""Checks of one array of an observation: shape, dtype, finite numbers, names, bounds.
 
-It arrives as an array, as nested lists out of JSON, or as a map from element name to value, alone or as a batch. Strict
-where a robot could be hurt: shape, dtype, non-finite numbers and names are errors, never guesses. What happens to a Box
-observation outside the space's bounds depends on the policy's options: RLlib's own pipeline computes an action for
-it, too.
+It arrives as an array, as nested lists from JSON, or as a map from element name to value, alone or as a batch. Checks
+are strict where a robot could be damaged: a wrong shape, dtype, number or name is an error, never a guess. A Box
+observation outside the space's bounds is treated as the policy's options say: RLlib's own pipeline also computes an
+action for it.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from rlservo.serve_app.runtime.options import DEFAULT_OPTIONS, PolicyOptions
 
 SMALL = 128  # elements up to which Python's own sum is faster than numpy's isfinite(...).all()
 NUMBERS = frozenset({float, int, bool})  # types that `struct` reads exactly
-LARGE = 2.0**53  # beyond it floats do not hold every integer; numpy picks one
+LARGE = 2.0**53  # beyond it floats cannot represent every integer; numpy picks one
 PACKED = {"float32": "f", "float64": "d"}
 
 
 class LeafParser:
-    """Parses one array of a policy's observations: the whole of it, or the leaf `name` of a nested one."""
+    """Parses one array of a policy's observations: the whole observation, or the leaf `name` of a nested one."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class LeafParser:
         options: PolicyOptions = DEFAULT_OPTIONS,
         drift: Drift | None = None,
     ) -> None:
-        """`drift` gets one in `EVERY` of the arrays that passed the checks, before it is clipped."""
+        """`drift` gets one in `EVERY` arrays that pass the checks, before clipping."""
         self._policy = policy
         self._name = name
         self._space = space
@@ -60,14 +60,14 @@ class LeafParser:
         self._ndim = len(self._shape)
         self._dtype = np.dtype(space.dtype)
         self._is_float = self._dtype.kind == "f"
-        # Of a choice that does not exist RLlib makes an error or a one-hot of nothing; a Box may be left.
+        # For a choice that does not exist RLlib raises an error or gives an empty one-hot; a Box may be exceeded.
         self._choices = None if isinstance(space, BoxSpec) else space.bounds()
         self._out_of_bounds = options.out_of_bounds
         self._bounded = isinstance(space, BoxSpec) and self._set_bounds(space)
         self._names = tuple(element.name for element in space.elements)
         self._drift = drift
-        self._until_drift = 1  # observations until the next one that is counted in
-        # The usual observation, a list of numbers, becomes an array in a fraction of numpy's time.
+        self._until_drift = 1  # observations until the next one that `drift` gets
+        # The usual observation, a list of numbers, is converted in a fraction of numpy's time.
         packs = self._ndim == 1 and space.size <= SMALL and space.dtype in PACKED
         self._packer = struct.Struct(f"{space.size}{PACKED[space.dtype]}") if packs else None
         self._named = bool(self._names) and len(set(self._names)) == len(self._names)
@@ -75,7 +75,7 @@ class LeafParser:
     def parse(self, obs: Any) -> tuple[NDArray[Any], bool, str]:
         """Return (`[batch, *shape]` of the graph's dtype, whether `obs` was a batch, notice).
 
-        The notice is a sentence on values that are out of bounds and used nevertheless, mostly empty. Raises
+        The notice is a sentence about values that are out of bounds and used anyway, usually empty. Raises
         ObservationError.
         """
         numbers = self._pack(obs) if type(obs) is list else None
@@ -101,13 +101,13 @@ class LeafParser:
         array: NDArray[Any] = np.empty(self._one, self._dtype)
         try:
             self._packer.pack_into(array.data, 0, *obs)
-        except (struct.error, OverflowError):  # more or fewer, or larger than a float can be
+        except (struct.error, OverflowError):  # too many or too few, or too large for a float
             return None
         values: list[float] = array.ravel().tolist()
         return (array, values) if sum(map(abs, values)) < LARGE else None
 
     def _read(self, obs: Any) -> tuple[NDArray[Any], list[float] | None, bool]:
-        """Return (array, its numbers if they are few, whether `obs` was a batch), checked but for its bounds."""
+        """Return (array, its numbers if they are few, whether `obs` was a batch), checked except for its bounds."""
         array: NDArray[Any]
         if type(obs) is np.ndarray:
             array = obs
@@ -128,7 +128,7 @@ class LeafParser:
             array = self._cast(array)
         values: list[float] | None = array.ravel().tolist() if array.size <= SMALL else None
         if self._is_float:
-            # One not-a-number or infinity makes the sum one. A sum that merely overflows is looked at again.
+            # One not-a-number or infinity makes the sum one. If the sum merely overflows, every element is checked.
             if values is None or not math.isfinite(sum(values)):
                 self._check_finite(array)
         elif self._choices is not None:
@@ -136,7 +136,7 @@ class LeafParser:
         return array, values, batch
 
     def _set_bounds(self, space: BoxSpec) -> bool:
-        """Set the bounds with their slack; return whether there is anything to check."""
+        """Set the bounds with their slack; return whether any have to be checked."""
         low, high = space.bounds()
         if self._dtype.kind in "iu":  # an image's 0..255 is its dtype's own range
             info = np.iinfo(self._dtype)
@@ -146,16 +146,16 @@ class LeafParser:
         slack = rounding_slack(low, high, self._dtype)
         self._low, self._high = low, high
         self._loosest = (low - slack, high + slack)
-        # The elements that have a bound, for the one observation that a control loop sends at a time.
+        # The bounded elements, for the single observation that a control loop sends.
         bounded = np.flatnonzero(np.isfinite(low.ravel()) | np.isfinite(high.ravel())).tolist()
         self._lows: list[float] = self._loosest[0].ravel()[bounded].tolist()
         self._highs: list[float] = self._loosest[1].ravel()[bounded].tolist()
-        # itemgetter of a single index gives no tuple; repeating it does no harm, since map stops at the shortest.
+        # itemgetter of a single index returns no tuple; repeating it is harmless, since map stops at the shortest.
         self._pick: Callable[[list[float]], Sequence[float]] = itemgetter(*bounded, *bounded[:1]) if bounded else tuple
         return checked and self._out_of_bounds != "accept"
 
     def _keep_bounds(self, array: NDArray[Any]) -> tuple[NDArray[Any], str]:
-        """Treat values outside the bounds as the options require; return (the array to use, notice)."""
+        """Handle values outside the bounds as the options require; return (the array to use, notice)."""
         outside = np.asarray((array < self._loosest[0]) | (array > self._loosest[1]))
         if not outside.any():
             return array, ""
@@ -183,7 +183,7 @@ class LeafParser:
 
     def _from_names(self, obs: Mapping[str, Any]) -> NDArray[Any]:
         if not self._named:
-            self._refuse("it is a map from names to values, but the policy's contract names no elements: send a list")
+            self._refuse("it is a map, but the policy's contract names no elements: send a list")
         try:
             values = [obs[name] for name in self._names]
         except KeyError:
@@ -196,7 +196,7 @@ class LeafParser:
         try:
             array = to_array(values)
         except (ValueError, TypeError, OverflowError, RecursionError):
-            self._refuse("its named values are not all single numbers, or all lists of one length (a batch)")
+            self._refuse("its named values must all be single numbers, or all lists of one length (a batch)")
         if array.dtype.kind not in NUMBER_KINDS:
             self._refuse_values(values, array)
         if array.ndim == 1:
@@ -246,7 +246,7 @@ class LeafParser:
         )
 
     def _refuse_values(self, obs: Any, array: NDArray[Any]) -> NoReturn:
-        """Name the first element that is not a number of an array of strings or objects."""
+        """Raise ObservationError for the first element that is not a number in an array of strings or objects."""
         path = first_non_number(obs, ())
         if path is None:
             self._refuse(f"it holds {array.dtype} values, not numbers")
@@ -273,7 +273,7 @@ class LeafParser:
         )
 
     def _refuse_element(self, array: NDArray[Any], bad: NDArray[np.bool_], why: str) -> NoReturn:
-        """Name the first element of the batch `array` where `bad` is true."""
+        """Raise ObservationError for the first element of the batch `array` where `bad` is true."""
         label, index = self._first(array, bad)
         value = array[index]
         raise ObservationError(

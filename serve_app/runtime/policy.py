@@ -1,4 +1,4 @@
-"""Exported policy in this process: an observation in, an action ready for `env.step` out.
+"""Exported policy in this process: from an observation to an action ready for `env.step`.
 
 `Policy.act` turns an observation into an action.
 """
@@ -47,14 +47,14 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 SHOWN_HASH = 12  # hexadecimal digits: enough to distinguish the graphs of one name and version
-NOTICE_EVERY_S = 60.0  # an observation out of bounds comes a hundred times a second, and is worth a line a minute
+NOTICE_EVERY_S = 60.0  # observations out of bounds may come a hundred times a second; a line a minute is enough
 Network = Callable[[dict[str, NDArray[Any]]], dict[str, NDArray[Any]]]
 """Computes tensors `[batch, ...]` by name from tensors by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Decision of the policy in an episode driven by another one (`Policy.follow`)."""
+    """Decision of a policy in an episode driven by another policy (`Policy.follow`)."""
 
     leaves: dict[str, NDArray[Any]]
     """The deterministic action by tensor name, `[batch, *shape]`."""
@@ -64,12 +64,12 @@ class Answer:
     """For the next step."""
 
 
-@dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
+@dataclass(slots=True)  # not frozen, which would cost every request half a microsecond
 class Step:
     """One step of an episode: the action, the next state, and the network's inputs."""
 
     action: Any
-    """In the action space's own form, a batch with its axis on every leaf."""
+    """In the action space's own form, with a batch axis on every leaf for a batch."""
     leaves: dict[str, NDArray[Any]]
     """The action by tensor name, `[batch, *shape]`."""
     state: State
@@ -79,18 +79,18 @@ class Step:
     inputs: Mapping[str, NDArray[Any]]
     """Inputs of the network, by tensor name."""
     notices: tuple[str, ...] = ()
-    """Warnings on values out of bounds or beyond a limit that were used anyway."""
+    """Warnings about values out of bounds or beyond a limit that were used anyway."""
     last_action: dict[str, NDArray[Any]] | None = None
-    """The caller's last action, from which a limit on the step counts, by tensor name; None if not given."""
+    """The caller's last action by tensor name, the base of a limit on the step; None if not given."""
 
     @property
     def rows(self) -> int:
-        """Number of its episodes."""
+        """Number of episodes."""
         return self.batch or 1
 
     @property
     def own_state(self) -> State:
-        """The state in the observation's own form: without a batch axis if that came alone."""
+        """The state in the observation's own form: without a batch axis for a single observation."""
         return self.state if self.batch is not None else {name: leaf[0, ...] for name, leaf in self.state.items()}
 
 
@@ -111,7 +111,7 @@ class Policy(Closeable):
         *,
         graph_hash: str = "",
     ) -> None:
-        """Wrap onnxruntime's session, whose graph fits `bundle.contract`; use `Policy.load`."""
+        """Wrap an onnxruntime session whose graph fits `bundle.contract`; use `Policy.load` instead."""
         contract = bundle.contract
         self._bundle = bundle
         self._graph_hash = graph_hash
@@ -121,7 +121,7 @@ class Policy(Closeable):
         self._ort_session: onnxruntime.InferenceSession | None = ort_session
         self._run: Run = ort_session.run
         self._run_whole: Run | None = None  # with the value head, once it is requested
-        self._rng: np.random.Generator | None = None  # numpy.random is 2 MB, of use only to policies that explore
+        self._rng: np.random.Generator | None = None  # numpy.random takes 2 MB, needed only by policies that explore
         self.options = options
         self.draw: Draw | None = None
         """Draw of the last exploring action, for a recording; None before the first."""
@@ -142,12 +142,12 @@ class Policy(Closeable):
         self._last: dict[str, NDArray[Any]] | None = None
         self.has_step_limit = bool(self._step_limit)
         self.is_stateful = bool(contract.state) or self.has_step_limit
-        """Whether an action depends on earlier steps: by a state, or by a limit on the last action."""
+        """Whether an action depends on earlier steps: through a state, or a limit on the step from the last action."""
         self.sees_reward = self._state_tensors.has_reward
         """Whether it was trained to see the reward of its last action."""
-        # Most policies read one array and give one: those few microseconds are what a control loop asks for.
+        # Most policies read one array and give one: this saves a control loop a few microseconds.
         leaves = self._observations.leaves
-        flat = "obs" in leaves and "action" in actions  # not a Dict or Tuple, which may have a single leaf
+        flat = "obs" in leaves and "action" in actions  # excludes a Dict or Tuple with a single leaf
         self._simple = flat and len(contract.inputs) == 1 and not self.is_stateful
         self._leaf = next(iter(leaves.values()))
         self._action_check = next(iter(self._action_checks.values()))
@@ -169,7 +169,7 @@ class Policy(Closeable):
         Checks hashes, the graph against the contract and, unless `check_golden` is off, that this machine reproduces
         the golden vectors. `threads` is onnxruntime's intra-op thread count; one is fastest for networks of this size.
 
-        `options` say how strict it is at its edges, `limits` how large the bundle's files may be.
+        `options` are its runtime options, `limits` bound the size of the bundle's files.
 
         Raises BundleError, BundleTamperedError or GoldenMismatchError, and UsageError if the options do not fit.
         """
@@ -184,7 +184,7 @@ class Policy(Closeable):
         if check_golden:
             check_golden_vectors(bundle, ort_session.run, outputs)
         if leaves_value_out(bundle):
-            del ort_session  # or both would be in memory
+            del ort_session  # otherwise both would be in memory
             ort_session = open_graph(bundle, threads, acts_only=True)
             if check_golden:
                 check_golden_vectors(bundle, ort_session.run, acting_outputs(bundle.contract))
@@ -206,7 +206,7 @@ class Policy(Closeable):
 
     @property
     def digest(self) -> str:
-        """Identity of the loaded bundle among those of its name and version."""
+        """Identity of the loaded bundle among those with its name and version."""
         return self._bundle.digest
 
     def act(
@@ -215,12 +215,12 @@ class Policy(Closeable):
         """Return the action for `obs`: one for one observation, a batch for a batch (see `ActingPolicy.act`).
 
         A nested observation is given, and a nested action returned, in the space's own form. A recurrent policy
-        continues from the `act` before, `reset()` begins an episode; in a batch each row is an episode of its own.
-        `reward` is what the last action brought, for a policy that was trained to see it.
+        continues from the previous `act`, `reset()` begins an episode; in a batch each row is an episode of its own.
+        `reward` is the reward of the last action, for a policy that was trained to see it.
 
         Raises ObservationError when `obs` does not fit the contract, RequestError when the policy cannot explore, lacks
-        the reward, or remembers another number of episodes, and ActionError when what came out is not finite or not in
-        the action space.
+        the reward, or remembers another number of episodes, and ActionError when the result is not finite or not in the
+        action space.
         """
         if self._simple and not explore:
             computed, _, batch, self.last_notices = self._compute(obs)
@@ -243,11 +243,11 @@ class Policy(Closeable):
         seed: int | None = None,
         reward: ArrayLike | None = None,
     ) -> Step:
-        """Decide one step of an episode and remember nothing.
+        """Decide one step of an episode without remembering anything.
 
-        `before` and `last` are an earlier step's `state` and `leaves`; `state` and `last_action` the same as a caller
-        sends them, which is checked. None of a pair begins an episode. Raises RequestError when they do not fit, and
-        what `act` raises.
+        `before` and `last` are an earlier step's `state` and `leaves`; `state` and `last_action` are the same from a
+        caller, and are checked. If both of a pair are None, an episode begins. Raises RequestError when they do not
+        fit, and what `act` raises.
         """
         if self._simple and not explore and before is None and state is None and last is None and last_action is None:
             computed, feed, batch, notices = self._compute(obs)
@@ -261,7 +261,7 @@ class Policy(Closeable):
         if known != rows:
             raise RequestError(
                 f"policy '{self._contract.name}' remembers {known} episode{'s' if known > 1 else ''} and got {rows} "
-                f"observation{'s' if rows > 1 else ''}: reset to begin others"
+                f"observation{'s' if rows > 1 else ''}: call reset() to begin others"
             )
         if state is not None:
             before = self._state_tensors.parse(state, rows, batch=batch)
@@ -289,10 +289,10 @@ class Policy(Closeable):
         last: Mapping[str, NDArray[Any]] | None = None,
         reward: ArrayLike | None = None,
     ) -> Answer:
-        """Return the policy's action, and remember nothing, at a step where the recorded policy gave `gave`.
+        """Return the policy's action at a step where the recorded policy gave `gave`; nothing is remembered.
 
-        That and `last` are leaves `[batch, *shape]`: what the policy sees of its actions is what was given, and what
-        limits count from is what the robot did before. Raises what `step` raises.
+        `gave` and `last` are leaves `[batch, *shape]`: the policy sees `gave` as its own action, and limits count from
+        `last`, the robot's previous command. Raises what `step` raises.
         """
         feed, _, _ = self._observations.parse(obs)
         rows = len(next(iter(feed.values())))
@@ -309,9 +309,10 @@ class Policy(Closeable):
         return Answer(action, inputs, self._state_tensors.next_state(computed, gave))
 
     def value(self, obs: Observation) -> NDArray[Any] | None:
-        """Return the critic's value of each observation `[batch]`; None if the graph has none, or remembers.
+        """Return the critic's value of each observation `[batch]`; None if the graph has none, or is recurrent.
 
-        The first call opens the whole graph; acting may need only a part. Raises the errors of `parse` and `load`.
+        The first call opens the whole graph, of which acting may need only a part. Raises the errors of `parse` and
+        `load`.
         """
         if self.is_stateful or all(tensor.name != VALUE for tensor in self._contract.outputs):
             return None
@@ -342,7 +343,7 @@ class Policy(Closeable):
     def network(self) -> Network:
         """Return the network: from `parse`'s result to the action's tensors by name (`build_action` checks them).
 
-        It is onnxruntime's own `run`: a running computation ends normally even if the policy is closed meanwhile.
+        It is onnxruntime's own `run`: a computation in progress ends normally even if the policy is closed.
         """
         run: Callable[..., Sequence[Any]] = self._open().run  # an action is dense: no sparse tensors, no maps
         names = list(self._action_checks)
@@ -356,15 +357,15 @@ class Policy(Closeable):
         return digest.digest()
 
     def clone(self) -> Policy:
-        """Return another policy over the same graph, for another thread: its recurrent state and drift are its own."""
+        """Return another policy over the same graph, for another thread, with its own recurrent state and drift."""
         return Policy(self._bundle, self._open(), self.options, graph_hash=self._graph_hash)
 
     def reset(self) -> None:
-        """Start an episode: a recurrent policy forgets. Nothing to do for a stateless one."""
+        """Start an episode: clear the state of a recurrent policy. Does nothing for a stateless one."""
         self._state = self._last = None
 
     def close(self) -> None:
-        """Drop the graph; `act` raises UsageError from now on."""
+        """Release the graph; later calls of `act` raise UsageError."""
         self._run = self._run_whole = _refuse_closed
         self._ort_session = None
 

@@ -1,6 +1,6 @@
 """Recurrent state as the graph's tensors: network state, frames, previous actions, reward.
 
-The caller keeps it: `Policy` keeps one, a server's clients may send theirs along.
+The caller keeps it: `Policy` keeps one, a server's clients may send theirs with each request.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class StateTensors:
     def inputs(self, state: State | None, rows: int, reward: ArrayLike | None) -> dict[str, NDArray[Any]]:
         """Return the graph's inputs besides the observation; a state of None begins an episode in every row.
 
-        Raises RequestError when the policy needs a reward, and none that fits is given.
+        Raises RequestError when the policy needs a reward, and none or an unsuitable one is given.
         """
         now = {name: spec.initial_value(rows) for name, spec in self._specs.items()} if state is None else state
         inputs = {f"state_in.{name}": value for name, value in now.items()}
@@ -43,7 +43,7 @@ class StateTensors:
         return inputs
 
     def next_state(self, computed: Mapping[str, NDArray[Any]], sampled: Mapping[str, NDArray[Any]] | None) -> State:
-        """Return the next state from the graph's outputs; `sampled` is the action if it is not the graph's own."""
+        """Return the next state from the graph's outputs; `sampled` is the action if it was not the graph's own."""
         after = {name: computed[f"state_out.{name}"] for name in self._specs}
         if sampled is not None and self._choices is not None:
             for name, spec in self._specs.items():
@@ -55,7 +55,7 @@ class StateTensors:
         return after
 
     def parse(self, state: Mapping[str, ArrayLike], rows: int, *, batch: bool) -> State:
-        """Return a caller's state as the graph's arrays. Raises RequestError, naming the unfit part."""
+        """Return a caller's state as the graph's arrays. Raises RequestError, which names the unfit part."""
         missing = [name for name in self._specs if name not in state]
         unknown = [str(name)[:64] for name in state if name not in self._specs]
         if missing or unknown:
@@ -74,18 +74,18 @@ class StateTensors:
                     f"policy '{self._policy}' expects state '{name}' of shape {expected}, got {array.shape}"
                 )
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise RequestError(f"state '{name}' of policy '{self._policy}' holds a number that is not finite")
+                raise RequestError(f"state '{name}' of policy '{self._policy}' has a number that is not finite")
             found[name] = array if batch else array[None]
         return found
 
     def _reward(self, starting: bool, rows: int, reward: ArrayLike | None) -> NDArray[np.float32]:
-        if starting and self._specs:  # without other memory, an episode's start looks like any step
-            return np.zeros(rows, np.float32)  # no reward yet, whatever the caller sent
+        if starting and self._specs:  # without other memory, an episode's start cannot be recognised
+            return np.zeros(rows, np.float32)  # no reward yet, even if the caller sent one
         if reward is None:
             start = "" if self._specs else ", 0 at an episode's start"
             raise RequestError(
-                f"policy '{self._policy}' was trained to see the reward of its last action: pass "
-                f"act(obs, reward=...), in a request 'reward'{start}"
+                f"policy '{self._policy}' was trained to see the reward of its last action: pass act(obs, reward=...), "
+                f"or in a request 'reward'{start}"
             )
         array = parse_array(reward, "float32", f"the reward for policy '{self._policy}'").reshape(-1)
         if len(array) != rows or not np.isfinite(array).all():

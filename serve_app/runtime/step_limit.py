@@ -1,7 +1,7 @@
 """Limit on the step of each element of an action.
 
-A network may answer a small change of its observation with a large change of its action; a gearbox may not. Who
-remembers the last action is the caller's affair.
+A network may answer a small change of its observation with a large change of its action, which a gearbox may not
+survive. The caller remembers the last action.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class StepLimit:
     def parse_last_action(self, last: Mapping[str, Any], rows: int, *, batch: bool) -> dict[str, NDArray[Any]]:
         """Return a caller's last action, by leaf, as `[batch, *shape]`.
 
-        Raises RequestError unless it is an action of the space: no limit holds against something else.
+        Raises RequestError unless it is an action of the space: a limit cannot be applied to anything else.
         """
         found: dict[str, NDArray[Any]] = {}
         for name, space in self._leaves.items():
             expected = (rows, *space.shape) if batch else space.shape
             array = parse_array(last[name], space.dtype, f"last_action of policy '{self._policy}'")
-            if not space.shape and array.shape == (*expected, 1):  # as RLlib, and so the graph, gives such an action
+            if not space.shape and array.shape == (*expected, 1):  # the form that RLlib and the graph give it
                 array = array.reshape(expected)
             low, high = space.bounds()
             slack = rounding_slack(low, high, array.dtype)
@@ -64,7 +64,7 @@ class StepLimit:
     ) -> tuple[dict[str, NDArray[Any]], tuple[str, ...]]:
         """Return (the action within its limits, a sentence for each leaf that was limited).
 
-        Raises ActionError if the options refuse instead.
+        Raises ActionError if the options refuse such a step instead.
         """
         notices: list[str] = []
         limited = dict(action)

@@ -1,9 +1,9 @@
-"""Checks of a request before its body is read: the form of its path, the host it names, the page it is from, its key.
+"""Checks of a request before its body is read: form of the path, host, origin of the page, API key.
 
-A browser lets any page send requests to any address that it reaches, the robot's own computer included, and lets it
-read the answers where the page's name leads to that address ("DNS rebinding"). So a request says which host it is for,
-and that must be one of this server's; and what may change something must not come from a page of another origin.
-Robots, their clients and proxies send neither an `Origin` nor a `Sec-Fetch-Site`.
+A browser lets any page send requests to any address that it reaches, including the robot's own computer, and lets it
+read the answers if the page's name resolves to that address ("DNS rebinding"). So a request names the host it is for,
+which must be this server; and a request that may change something must not come from a page of another origin. Robots,
+their clients and proxies send neither an `Origin` nor a `Sec-Fetch-Site`.
 
 Sources: Fetch Standard, section 3.1 (Origin); W3C Fetch Metadata Request Headers; RFC 9110, section 7.2 (Host).
 """
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from rlservo.serve_app.server.current_keys import CurrentKeys
     from rlservo.serve_app.wire.asgi import Scope
 
-# Every path of ours can be written in it. What needs escaping, or is read differently by different programs, is not
-# routed at all: control characters, encoded and doubled slashes, dot segments, ';', '\'.
+# Enough for every path of ours. Characters that need escaping, or that programs read differently, are never routed:
+# control characters, encoded and doubled slashes, dot segments, ';', '\'.
 PATH = re.compile(r"(?:/(?!\.\.?(?:/|\Z))[A-Za-z0-9._~-]+)*/?")
 HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+?)\.?(?::[0-9]{1,5})?")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that change nothing
@@ -40,17 +40,17 @@ PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
 LABEL = LABEL_HEADER.encode()
-HEADERS = "rlservo.headers"  # in a connection's scope: what `fold_headers` gave
+HEADERS = "rlservo.headers"  # in a connection's scope: the result of `fold_headers`
 MAY_EXPLORE = "rlservo.may_explore"  # in a connection's scope: whether its key may ask for exploring actions
-REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: of its reply, besides the protocol's own
+REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: headers of its reply besides the protocol's own
 ANY_HOST = "*"
 
 
 def check_path(scope: Scope, path: str) -> None:
-    """Raise RequestError unless the path is written in the one way in which a path of ours can be."""
+    """Raise RequestError unless the path is written in the only form that this server routes."""
     if b"%" in (scope.get("raw_path") or b"") or PATH.fullmatch(path) is None:
         raise RequestError(
-            "the path is not usable: it may hold letters, digits, '.', '_', '-' and '~' between single slashes, "
+            "the path is not valid: expected letters, digits, '.', '_', '-' and '~' between single slashes, "
             "without percent-encoding and without the segments '.' and '..'"
         )
 
@@ -59,10 +59,10 @@ class Hosts:
     """The names and addresses by which requests may call this server."""
 
     def __init__(self, listening_on: str, settings: ServerSettings, *, keyed: bool) -> None:
-        """Take the address listened on; `keyed`: whether every action needs an API key."""
+        """Take the address that the server listens on; `keyed`: whether every action needs an API key."""
         names = {name.strip().lower() for name in settings.allowed_hosts.split(",")} - {""}
         self._local = is_loopback(listening_on)
-        # A page does not know the key, whatever name it is of; and clusters call servers by many names.
+        # A page does not know the key, whatever its name; and clusters call servers by many names.
         self._any = ANY_HOST in names or (keyed and not self._local and not names)
         self._names = names | {"localhost", listening_on.strip("[]").lower()}
         if not self._local:
@@ -89,14 +89,14 @@ class Hosts:
             address = ipaddress.ip_address(name)
         except ValueError:
             return False
-        # An address cannot be made to lead elsewhere, as a name can. Orchestrators probe by address.
+        # An address cannot be redirected, as a name can. Orchestrators probe by address.
         return address.is_loopback or not self._local
 
 
 def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key | None:
-    """Return the key that opens what a route, or a method, grants, None if it needs none.
+    """Return the key that permits a route or a method; None if it needs none.
 
-    It counts as a request of that key. Raises UnauthenticatedError, ForbiddenError or RateLimitError.
+    The call counts as a request with that key. Raises UnauthenticatedError, ForbiddenError or RateLimitError.
     """
     if access is Access.open:
         return None
@@ -108,20 +108,20 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
             )
         return None
     if presented is None:
-        what = "administration needs an admin" if admin else "this server wants an API"
+        what = "administration needs an admin" if admin else "this server requires an API"
         raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
     key = find_key(accepted, presented)
     if key is None:
-        raise UnauthenticatedError("this API key is not known to the server")
+        raise UnauthenticatedError("the server does not know this API key")
     if key.limit is not None:
         keys.limits.spend(key, key.limit)
     if admin and key.role is not Role.admin:
-        raise ForbiddenError(f"the key '{key.label}' may ask for actions, and this needs an admin key", key=key.label)
+        raise ForbiddenError(f"the key '{key.label}' is for actions; this request needs an admin key", key=key.label)
     return key
 
 
 def find_key(keys: Keys, presented: bytes) -> Key | None:
-    """Return the key that was presented. Every kept digest is compared, each in constant time."""
+    """Return the key that was presented. It is compared with every stored digest, each in constant time."""
     digest = hashlib.sha256(presented).digest()
     found = None
     for key in keys.keys if keys.operator is None else (*keys.keys, keys.operator):
@@ -141,7 +141,7 @@ class StreamKey:
         self._key: Key | None = None
 
     def check(self) -> None:
-        """Check the key for one more request. Raises as `authorize` does: RateLimitError is about this one alone."""
+        """Check the key for one more request. Raises as `authorize` does; RateLimitError concerns only this request."""
         if self._changes != self._keys.changes:
             changes = self._keys.changes
             self._key = authorize(self._keys, self._presented, Access.act)
@@ -156,14 +156,14 @@ class StreamKey:
 
 
 class AccessChecks:
-    """Refuses, by their headers, HTTP requests and WebSockets that no client of ours sends or that have no key."""
+    """Refuses HTTP requests and WebSockets by their headers: wrong host, wrong origin, or no key."""
 
     def __init__(self, hosts: Hosts, keys: CurrentKeys) -> None:
         self._hosts = hosts
         self._keys = keys
 
     def check(self, scope: Scope, headers: Mapping[bytes, bytes], access: Access) -> Key | None:
-        """Return the key that opens what `access` says; `headers` are the scope's (`fold_headers`).
+        """Return the key that permits `access`; `headers` are the scope's (`fold_headers`).
 
         Raises ForbiddenError for another host's request or another origin's page, UnauthenticatedError or
         ForbiddenError by the key, RequestError for a header that is not UTF-8.
@@ -173,7 +173,7 @@ class AccessChecks:
             raise RequestError("the request has two Host headers: send one")
         if host is not None and not self._hosts.permit(host):
             raise ForbiddenError(
-                f"this server is not called '{host[:100].decode('latin-1')}': call it by its address, or name it in "
+                f"the request names the host '{host[:100].decode('latin-1')}': call it by its address, or name it in "
                 "RLSERVO_ALLOWED_HOSTS"
             )
         if (b"origin" in headers or b"sec-fetch-site" in headers) and (
@@ -187,7 +187,7 @@ class AccessChecks:
 
 
 def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
-    """Return headers by name: of several of one name the first, or all, where every one of them must be right."""
+    """Return headers by name: the first of several with one name, or all of them if each must be right."""
     pairs = list(headers)
     folded = dict(pairs)
     if len(folded) == len(pairs):
@@ -201,7 +201,7 @@ def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
 
 
 def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
-    """Return a header as text, None if it is not there."""
+    """Return a header as text, or None if it is absent."""
     value = headers.get(name)
     return None if value is None else value.decode("latin-1")
 
@@ -236,9 +236,9 @@ def _check_readable(headers: Mapping[bytes, bytes]) -> None:
 
 def _check_page(origin: bytes | None, site: bytes | None, host: bytes | None) -> None:
     if site is not None and site.strip().lower() not in OWN_SITES:
-        raise ForbiddenError("a web page of another site may ask nothing of this server")
+        raise ForbiddenError("web pages of other sites may not use this server")
     own = () if host is None else {scheme + host.lower() for scheme in PAGE_SCHEMES}
     if origin is not None and origin.lower() not in own:
         raise ForbiddenError(
-            f"a web page of {origin[:100].decode('latin-1')} may ask nothing of this server: only its own may"
+            f"a web page of {origin[:100].decode('latin-1')} may not use this server: only its own pages may"
         )

@@ -1,4 +1,4 @@
-"""Admin key that `rlservo serve` makes for its user: a file for this user alone, gone with the server.
+"""Admin key that `rlservo serve` makes for its user: a file that only this user can read, removed with the server.
 
 The file's place follows from the port, so that `rlservo policy` on the same machine finds it by itself.
 """
@@ -19,9 +19,9 @@ logger = logging.getLogger(__name__)
 
 @contextlib.contextmanager
 def operator_key(file: Path) -> Iterator[str]:
-    """Write a new key to `file`, for this user alone, and remove it in the end.
+    """Write a new key to `file`, readable only by this user, and remove it at the end.
 
-    Gives its `sha256:<hash>`; '' if the file cannot be written, which is logged.
+    Yields its `sha256:<hash>`, or '' if the file cannot be written, which is logged.
     """
     key, _ = new_key("operator", admin=True)
     digest = digest_of(key)
@@ -29,12 +29,12 @@ def operator_key(file: Path) -> Iterator[str]:
         try:
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             file.unlink(missing_ok=True)  # of a server that was killed
-            # Created for us alone: a file or link that another user put there is not used.
+            # Must be a new file: a file or link that another user put there is not used.
             descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
             with os.fdopen(descriptor, "w") as stream:
                 stream.write(key + "\n")
         except OSError as error:
-            logger.warning("no admin key, and so no 'rlservo policy': %s cannot be written (%s)", file, error.strerror)
+            logger.warning("no admin key for 'rlservo policy': %s cannot be written (%s)", file, error.strerror)
             digest = ""
         yield digest
     finally:
@@ -47,7 +47,7 @@ def digest_of(key: str) -> str:
 
 
 def remove_key(file: Path, digest: str) -> None:
-    """Remove the key file of the server whose key has this digest; one of a server that came after it stays."""
+    """Remove the key file if its key has this digest; the file of a later server stays."""
     with contextlib.suppress(OSError, UnicodeDecodeError):
         if digest_of(file.read_text(encoding="ascii").strip()) == digest:
             file.unlink()

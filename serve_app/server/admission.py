@@ -1,7 +1,7 @@
-"""Admission of requests: refused are those that came too late, and those that are too much for one event loop.
+"""Admission of requests: those that are too late, or too many for one event loop, are refused.
 
-All requests that arrived while the loop was busy run in one turn of it, a *burst*. Its length is the queue, its
-beginning when each of them had arrived at the latest. That is known for the price of one callback per burst.
+All requests that arrived while the loop was busy run in one turn of it, a *burst*. Its length is the queue; by its
+beginning all of them had arrived. Measuring this costs one callback per burst.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from rlservo.serve_app.server.settings import ServerSettings
 logger = logging.getLogger(__name__)
 
 TICK_S = 0.05
-SETTLE_S = 0.1  # of a loop that turns again, in which it reads what had waited
+SETTLE_S = 0.1  # for a loop that runs again to read what had waited
 
 
 class Admission:
-    """Refuses what came too late, or what is too much for one event loop."""
+    """Refuses requests that are too late, or too many for one event loop."""
 
     def __init__(self, settings: ServerSettings) -> None:
-        """Take the limits: of a burst, of the wait before and in it, of bodies half sent, of streams."""
+        """Take the limits: length of a burst, wait before and in it, unfinished bodies, streams."""
         self._max_queued = settings.max_ongoing_requests
         self.max_wait_s = settings.max_queue_ms / 1e3
         self._max_incoming = settings.max_incoming
@@ -42,12 +42,12 @@ class Admission:
         now = time.perf_counter()
         if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > self.max_wait_s:
             raise LateError(
-                f"the server was blocked for more than {self.max_wait_s * 1e3:g} ms, and the observation may be as "
-                "old: send a newer one"
+                f"the server was blocked for more than {self.max_wait_s * 1e3:g} ms, so the observation may be stale: "
+                "send a newer one"
             )
 
     def enter(self) -> float:
-        """Return when this request had arrived at the latest (`time.perf_counter`).
+        """Return the time by which this request had arrived (`time.perf_counter`).
 
         Raises OverloadedError or LateError.
         """
@@ -71,7 +71,7 @@ class Admission:
 
     @contextlib.contextmanager
     def reading_body(self) -> Iterator[None]:
-        """Count a request whose body has come in part. Raises OverloadedError."""
+        """Count a request whose body has arrived only in part. Raises OverloadedError."""
         if self.incoming >= self._max_incoming:
             raise OverloadedError(f"{self.incoming} requests are still being sent to this server: try again shortly")
         self.incoming += 1
@@ -87,25 +87,25 @@ class Admission:
         self.streams += 1
 
     def close_stream(self) -> None:
-        """Count it no longer."""
+        """Count one stream less."""
         self.streams -= 1
 
 
 class LoopClock:
-    """Ticks in the event loop, and remembers when it did so late.
+    """Ticks in the event loop, and remembers when a tick was late.
 
-    A stopped process, a long computation or a starved machine blocks the loop. What is read right after has waited for
-    an unknown time, up to all of it.
+    A stopped process, a long computation or a starved machine blocks the loop. Data that is read right afterwards may
+    have waited for that whole time.
     """
 
     def __init__(self, limit_s: float) -> None:
-        """Take a tick that is later than `limit_s` for a loop that stood still."""
+        """Treat a tick that is later than `limit_s` as a blocked loop."""
         self._limit_s = limit_s
         self._loop: asyncio.AbstractEventLoop | None = None
         self.next_tick = float("inf")
-        """When it is due, by `time.perf_counter`; the clock does not run yet."""
+        """Time of the next tick, by `time.perf_counter`; infinite until the clock runs."""
         self.unknown_until = 0.0
-        """Until then it is unknown how long what is read had waited."""
+        """Until then it is unknown how long the data being read had waited."""
 
     def start(self) -> None:
         """Tick in the running event loop from now on."""
@@ -117,7 +117,7 @@ class LoopClock:
         now = time.perf_counter()
         behind = now - self.next_tick
         if behind > self._limit_s:
-            logger.warning("the event loop was blocked for %.1f s: requests that waited meanwhile are refused", behind)
+            logger.warning("the event loop was blocked for %.1f s: requests that waited are refused", behind)
             self.unknown_until = now + SETTLE_S
         elif now < self.unknown_until and behind > TICK_S:  # still reading
             self.unknown_until = now + SETTLE_S

@@ -1,6 +1,6 @@
-"""API keys, kept as hashes, and what they are for; `access_checks.py` checks requests against them.
+"""API keys, kept as hashes, and their roles; `access_checks.py` checks requests against them.
 
-A key is 256 random bits, so its plain SHA-256 is all that needs keeping: there is no dictionary to try. A line of the
+A key is 256 random bits, so storing its plain SHA-256 is enough: a dictionary attack is hopeless. A line of the
 key file, or an entry of RLSERVO_API_KEYS (separated by commas), is
 
     <label> <act|explore|admin> sha256:<64 hexadecimal digits> [rate=<requests a second> [burst=<requests at once>]]
@@ -35,15 +35,15 @@ KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets recognise it
 A_KEY = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{16,}")
 KEY_BYTES = 32
 LONGEST_FILE = 1 << 20  # [bytes] of the key file: some ten thousand keys
-SCHEMES = (b"bearer", b"api-key")  # the second is what openpi's clients say
+SCHEMES = (b"bearer", b"api-key")  # openpi's clients send the second
 
 
 class Role(str, Enum):
-    """Role of a key; each may also do all that the ones before it may."""
+    """Role of a key; each role includes those before it."""
 
     act = "act"
     explore = "explore"
-    """Also for actions that are drawn from the policy's distribution, which `rlservo learn` learns from."""
+    """Also actions drawn from the policy's distribution, from which `rlservo learn` learns."""
     admin = "admin"
 
 
@@ -69,7 +69,7 @@ class RateLimit:
 
     @classmethod
     def parse(cls, rate: str | None, burst: str | None) -> RateLimit | None:
-        """Return a line's limit; the burst is a second's requests if it is not said. Raises ValueError for 0."""
+        """Return a line's limit; the default burst is one second's requests. Raises ValueError for 0."""
         if rate is None:
             return None
         if not float(rate):
@@ -79,7 +79,7 @@ class RateLimit:
 
 @dataclass(frozen=True)
 class Key:
-    """A key as it is kept: not the key itself."""
+    """A stored key: its hash, not the key itself."""
 
     label: str
     role: Role
@@ -93,15 +93,15 @@ class Key:
 
 @dataclass(frozen=True)
 class Keys:
-    """The keys a server accepts; none at all means that it asks for none."""
+    """The keys that a server accepts; if there are none, it requires none."""
 
     keys: tuple[Key, ...] = ()
     operator: Key | None = None
-    """For administration; a server with this one alone needs no key for actions."""
+    """For administration; a server with only this key requires none for actions."""
 
     @classmethod
     def from_settings(cls, settings: ServerSettings, *, file_content: bytes | None = None) -> Self:
-        """Read the file (unless its content is given) and the entries that the settings name. Raises UsageError."""
+        """Read the file (unless its content is given) and the entries in the settings. Raises UsageError."""
         lines: list[tuple[str, str]] = []
         if settings.api_keys_file is not None:
             file = Path(settings.api_keys_file)
@@ -111,33 +111,33 @@ class Keys:
         keys = []
         for where, line in lines:
             match = LINE.fullmatch(line)
-            if match is None:  # the line is not shown: it may be a key by mistake
+            if match is None:  # the line is not shown: it may hold a key by mistake
                 raise UsageError(
-                    f"{where}: expected '<label> <act|explore|admin> sha256:<64 hexadecimal digits>', as "
-                    "'rlservo key LABEL' makes it, and after it 'rate=<requests a second> burst=<requests>' or nothing"
+                    f"{where}: expected '<label> <act|explore|admin> sha256:<64 hexadecimal digits>', as 'rlservo key "
+                    "LABEL' makes it, optionally followed by 'rate=<requests a second> burst=<requests>'"
                 )
             try:
                 limit = RateLimit.parse(match["rate"], match["burst"])
             except ValueError:
-                raise UsageError(f"{where}: a rate of 0 would let the key ask nothing: leave its line out") from None
+                raise UsageError(f"{where}: a rate of 0 would refuse every request: leave the line out") from None
             keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"]), limit))
         if (settings.api_keys_file is not None or settings.api_keys.strip()) and not keys:
             raise UsageError(
-                "the key settings name no key, and would leave the server open: add one, or leave them out"
+                "the key settings hold no key and would leave the server open: add a key, or remove the settings"
             )
         digest = settings.operator_key.removeprefix("sha256:")
         return cls(tuple(keys), Key("operator", Role.admin, bytes.fromhex(digest)) if digest else None)
 
 
 def without_keys(text: str) -> str:
-    """Return a client's text with dots in place of the keys in it."""
+    """Return a client's text with any keys in it replaced by dots."""
     return A_KEY.sub(f"{KEY_PREFIX}...", text)
 
 
 def new_key(
     label: str, *, admin: bool = False, explore: bool = False, rate: float | None = None, burst: int | None = None
 ) -> tuple[str, str]:
-    """Return (the key, for the client alone; its line, for the server). Raises UsageError."""
+    """Return (the key, for the client; its line, for the server). Raises UsageError."""
     if burst is not None and rate is None:
         raise UsageError("--burst needs a rate: also give the requests per second")
     role = "admin" if admin else "explore" if explore else "act"
@@ -153,7 +153,7 @@ def new_key(
 
 
 def check_exposure(host: str, settings: ServerSettings) -> Keys:
-    """Return the keys; raise UsageError where others than this machine could ask for actions without one."""
+    """Return the keys; raise UsageError if other machines could request actions without one."""
     keys = Keys.from_settings(settings)
     if not keys.keys and not settings.allow_unauthenticated and not is_loopback(host):
         raise UsageError(
@@ -165,7 +165,7 @@ def check_exposure(host: str, settings: ServerSettings) -> Keys:
 
 
 def read_key_file(file: Path) -> bytes:
-    """Return the file's content. Raises UsageError if it cannot be read or anybody could have written it."""
+    """Return the file's content. Raises UsageError if it cannot be read, or if every user can write it."""
     try:
         with open_regular(file, LONGEST_FILE) as stream:
             mode = os.fstat(stream.fileno()).st_mode
@@ -175,7 +175,7 @@ def read_key_file(file: Path) -> bytes:
     except OSError as error:
         raise UsageError(f"the key file {file} cannot be read: {error.strerror}") from None
     if mode & stat.S_IWOTH:
-        raise UsageError(f"the key file {file} can be written by every user of this machine: chmod o-w {file}")
+        raise UsageError(f"the key file {file} is writable by every user of this machine: run chmod o-w {file}")
     return content
 
 

@@ -1,7 +1,7 @@
-"""Bounds of a request's content, held before anything is parsed or computed: bytes, values and observations.
+"""Bounds on a request's content, checked before anything is parsed or computed: bytes, values and observations.
 
-A few megabytes of `[]` or of unknown fields take a parser seconds in which nothing else is answered. What separates
-values in JSON is counted in a millisecond, and `max_batch` observations of a policy need only so much of it.
+A few megabytes of `[]` or of unknown fields take a parser seconds in which nothing else is answered. Counting JSON's
+separators takes a millisecond, and `max_batch` observations need a known number of them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rlservo.serve_app.versions.policy_store import PolicyStore
 SMALL = 1 << 14  # [bytes] content up to which no parser takes long
 SPARE = 1000  # values besides observations and states: options, tensors, names
 SPARE_BYTES = 1 << 16
-NUMBER_BYTES = 64  # of a number's text, with what separates and indents it
+NUMBER_BYTES = 64  # of a number's text, with separator and indentation
 LENGTH, ARRAYS = b"length", b"arrays"
 ARRAY_VALUES = 12  # of a map that is an array
 MARKS = {b",": "values", b"[": "lists", b"{": "maps", b":": "fields"}  # before each one, but for a list's first value
@@ -33,11 +33,11 @@ MARKS = {b",": "values", b"[": "lists", b"{": "maps", b":": "fields"}  # before 
 
 @dataclass(frozen=True, slots=True)
 class ContentBounds:
-    """The most that one policy's content may hold."""
+    """Upper bounds for the content of a request to one policy."""
 
     content_bytes: int
     values: int
-    """Entries of lists and maps, and these once more, in msgpack, where arrays are maps."""
+    """Entries of lists and maps, plus the lists and maps themselves, in msgpack, where arrays are maps."""
     counts: Mapping[bytes, int]
     """Allowed number of each of MARKS in JSON."""
     densities: Mapping[bytes, float]
@@ -45,7 +45,7 @@ class ContentBounds:
 
     @classmethod
     def of(cls, contract: Contract, max_batch: int) -> ContentBounds:
-        """Return the bounds for `max_batch` observations with all that can come with each."""
+        """Return the bounds for `max_batch` observations with everything that can accompany each."""
         parts = [_need_of(contract.observation_space), _need_of(contract.action_space), _need_of_array(())]
         parts += [_need_of_array(state.shape) for state in contract.state]
         row = sum(parts, Counter[bytes]())
@@ -63,7 +63,7 @@ class ContentBounds:
         )
 
     def exceeded_by(self, content: bytes) -> str:
-        """Return what JSON holds more of than can be needed, '' if it holds no more."""
+        """Return the bound that the JSON exceeds, such as '900 lists', or ''."""
         for mark, most in self.counts.items():
             most = min(most, SPARE + int(self.densities.get(mark, 1.0) * len(content)))
             if content.count(mark) > most:
@@ -75,9 +75,9 @@ _bounds: WeakKeyDictionary[Policy, ContentBounds] = WeakKeyDictionary()
 
 
 def check_length(store: PolicyStore, name: str, content: Any, max_batch: int) -> list[ContentBounds]:
-    """Return the bounds of a policy's versions, of which a session or a state may be with any.
+    """Return the bounds over a policy's versions: a session or a state may belong to any of them.
 
-    Raises TooLargeError where content is longer than `max_batch` observations of each need, and UnknownPolicyError.
+    Raises TooLargeError if the content is longer than `max_batch` observations need, and UnknownPolicyError.
     """
     policies = [store.get(name, version) for version in store.versions(name)]
     for policy in policies:
@@ -91,7 +91,7 @@ def check_length(store: PolicyStore, name: str, content: Any, max_batch: int) ->
 
 
 def check_json(store: PolicyStore, name: str, content: Any, max_batch: int) -> None:
-    """Raise TooLargeError where JSON holds more than `max_batch` observations of any version need."""
+    """Raise TooLargeError if the JSON holds more than `max_batch` observations of any version need."""
     text = bytes(content)
     exceeded = [each.exceeded_by(text) for each in check_length(store, name, text, max_batch)]
     if all(exceeded):
@@ -100,13 +100,13 @@ def check_json(store: PolicyStore, name: str, content: Any, max_batch: int) -> N
 
 def _too_large(name: str, what: str, max_batch: int) -> TooLargeError:
     return TooLargeError(
-        f"the request holds more than {what}: {max_batch} observations of policy '{name}' need fewer",
+        f"the request holds more than {what}: {max_batch} observations of policy '{name}' need no more",
         {"policy": name, "max_batch": max_batch},
     )
 
 
 def _need_of(space: SpaceSpec) -> Counter[bytes]:
-    """Return how often each of MARKS stands in a value's shortest JSON and a comma behind it, and its LENGTH."""
+    """Count each of MARKS in a value's shortest JSON with the comma that follows, and its LENGTH."""
     if isinstance(space, DictSpec):
         text = sum(len(key) + len('"":') for key in space.spaces)
         own = Counter({b"{": 1, b":": len(space.spaces), b",": 1, LENGTH: text + len("{},")})
@@ -122,7 +122,7 @@ def _need_of_array(shape: Sequence[int]) -> Counter[bytes]:
 
 
 def most_rows(obs: Any) -> int:
-    """Return how many observations there are at most, whatever the space is: `count_rows` looks closer."""
+    """Return an upper bound on the number of observations in any space; `count_rows` counts precisely."""
     most, parts = 0, [obs]
     while parts:
         part = parts.pop()
@@ -131,12 +131,12 @@ def most_rows(obs: Any) -> int:
         else:
             most = max(most, _length(part))
             if type(part) in (list, tuple) and part and type(part[0]) in (dict, list, tuple, np.ndarray):
-                parts.append(part[0])  # the parts of a Tuple are of one batch
+                parts.append(part[0])  # the parts of a Tuple share one batch
     return most
 
 
 def count_rows(space: SpaceSpec, obs: Any) -> int:
-    """Return how many observations a large `obs` holds; an array as long as the space's own is one."""
+    """Return the number of observations in a large `obs`; an array as long as the space's is one."""
     if isinstance(space, DictSpec | TupleSpec):
         if isinstance(space, DictSpec) and type(obs) is list:
             return len(obs)  # of single observations

@@ -1,9 +1,8 @@
-"""API keys in use: read from their file again while the server runs, and limited in rate, by every process for itself.
+"""API keys in use: each process rereads their file while the server runs, and limits their rate by itself.
 
-The file is read twice a second in a thread of its own: a stat or read of a file system that hangs must not stop those
-who act. Its whole content is compared, so it does not matter how it was changed: written in place, renamed over,
-or behind the symbolic links that Kubernetes swaps. Content that would
-refuse a start changes nothing, and is logged once.
+The file is read twice a second in a thread of its own: a file system that hangs must not delay actions. Its whole
+content is compared, so it does not matter how it was changed: written in place, renamed over, or behind the symbolic
+links that Kubernetes swaps. Content with which a server would not start changes nothing, and is logged once.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ from rlservo.serve_app.server.settings import ServerSettings
 
 
 class RateLimits:
-    """Remaining requests of each key with a limit. Keys without one are never seen here."""
+    """Remaining requests of each key with a limit. Keys without a limit are not tracked."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._buckets: dict[str, tuple[float, float]] = {}  # by label: tokens, and when there were so many
+        self._buckets: dict[str, tuple[float, float]] = {}  # by label: tokens, and when they were counted
         self.refused: Counter[str] = Counter()
         """Requests refused, by label."""
 
     def spend(self, key: Key, limit: RateLimit) -> None:
-        """Count a request of a key. Raises RateLimitError if it has asked too often."""
+        """Count a request of a key. Raises RateLimitError beyond its limit."""
         now = self._clock()
         tokens, since = self._buckets.get(key.label, (float(limit.burst), now))
         tokens = min(float(limit.burst), tokens + (now - since) * limit.rate)
@@ -40,8 +39,8 @@ class RateLimits:
             self.refused[key.label] += 1
             wait_s = (1.0 - tokens) / limit.rate
             raise RateLimitError(
-                f"the key '{key.label}' may ask {limit.rate:g} times a second here, {limit.burst} times at once: wait "
-                f"{wait_s:.3g} s",
+                f"the key '{key.label}' allows {limit.rate:g} requests a second in this process, {limit.burst} at "
+                f"once: wait {wait_s:.3g} s",
                 {"retry_after_s": round(wait_s, 3)},
                 key=key.label,
             )
@@ -50,15 +49,15 @@ class RateLimits:
 
 logger = logging.getLogger(__name__)
 
-PERIOD_S = 0.5  # [s] between looks; what two in a row saw is used, as one alone may see half of what is being written
-STALE_S = 10.0  # [s] without an answer of the file system until the keys count as not current
+PERIOD_S = 0.5  # [s] between reads; content is used once two in a row agree, as one may catch a half-written file
+STALE_S = 10.0  # [s] without an answer from the file system until the keys count as outdated
 
 
 class CurrentKeys:
     """`Keys` that follow their file while this object exists."""
 
     def __init__(self, settings: ServerSettings) -> None:
-        """Read what the settings name, as `Keys.from_settings`. Raises UsageError."""
+        """Read the keys that the settings name, as `Keys.from_settings` does. Raises UsageError."""
         self._settings = settings
         file = settings.api_keys_file
         content = None if file is None else read_key_file(Path(file))
@@ -70,20 +69,20 @@ class CurrentKeys:
         self._refused = ""
         self._looked_at = time.monotonic()
         self.changes = 0
-        """Number of changes, so that a caller can see whether to check a key again."""
+        """Number of changes, which tells a caller whether to check a key again."""
         if file is not None:
             watcher = threading.Thread(target=_watch, args=(weakref.ref(self),), name="key-file", daemon=True)
             watcher.start()
 
     @property
     def current(self) -> bool:
-        """Whether these are the file's keys, and not older ones because the file cannot be used or read."""
+        """Whether these are the file's current keys; False if the file cannot be used or read."""
         if self._settings.api_keys_file is None:
             return True
         return not self._refused and time.monotonic() - self._looked_at < STALE_S
 
     def refresh(self) -> None:
-        """Look at the file; use what it holds when this is the second look in a row to see the same."""
+        """Read the file; use its content once two reads in a row have seen the same."""
         assert self._settings.api_keys_file is not None
         seen, before = _look(Path(self._settings.api_keys_file)), self._seen
         self._seen, self._looked_at = seen, time.monotonic()
@@ -96,10 +95,10 @@ class CurrentKeys:
             keys = Keys.from_settings(self._settings, file_content=seen)
         except UsageError as error:
             self._refused = error.message
-            logger.error("the API keys stay as they were: %s", error.message)
+            logger.error("the API keys were not changed: %s", error.message)
             return
         if self._refused or keys != self.accepted:
-            logger.warning("the API keys were read again: %s", _difference(self.accepted, keys))
+            logger.warning("the API keys were reread: %s", _difference(self.accepted, keys))
         self._refused = ""
         if keys != self.accepted:
             self.accepted = keys
@@ -107,7 +106,7 @@ class CurrentKeys:
 
 
 def _look(file: Path) -> bytes | str:
-    """Return the file's content, or why it cannot be used."""
+    """Return the file's content, or the reason why it cannot be used."""
     try:
         return read_key_file(file)
     except UsageError as error:
@@ -123,11 +122,11 @@ def _watch(reference: weakref.ref[CurrentKeys]) -> None:
         try:
             keys.refresh()
         except Exception:
-            logger.exception("the API keys' file could not be looked at; the keys stay as they were")
+            logger.exception("the API key file cannot be read; the keys were not changed")
         del keys
 
 
 def _difference(before: Keys, after: Keys) -> str:
     added = [f"'{key.label}' added" for key in after.keys if key not in before.keys]
     removed = [f"'{key.label}' removed" for key in before.keys if key not in after.keys]
-    return ", ".join(added + removed) or "they are as they were"
+    return ", ".join(added + removed) or "nothing changed"

@@ -1,4 +1,4 @@
-"""Listing of policies and versions: what this process serves, since when, and what failed to load."""
+"""Listing of policies and versions: those served by this process, since when, and those that failed to load."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from rlservo.serve_app.versions.plan_follower import VersionState
 
 
 def describe(handler: RequestHandler) -> dict[str, Any]:
-    """Return what `GET /v1/policies` answers; states, counts and comparisons are this process's own.
+    """Return the reply to `GET /v1/policies`; states, counts and comparisons are this process's own.
 
-    `version` is where the alias `production` leads, `versions` are those that answer, the oldest first, `previous` is
-    where a rollback of each alias would lead. A version is `loading`, `ready` or `failed`. `generation` is the plan's
-    number; `behind` says what of it this process could not follow.
+    `version` is the target of the alias `production`, `versions` are those that answer, the oldest first, `previous` is
+    the target of a rollback of each alias. A version is `loading`, `ready` or `failed`. `generation` is the plan's
+    number; `behind` lists the parts of it that this process could not follow.
     """
     store, control = handler.store(), handler.control
     plan = control.plan if control is not None else None
@@ -60,7 +60,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
 
 
 def states_of(handler: RequestHandler) -> dict[str, dict[str, VersionState]]:
-    """Return how every version stands, by name."""
+    """Return the state of every version, by name."""
     if handler.control is not None:
         return handler.control.states()
     store = handler.store()

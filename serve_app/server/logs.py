@@ -1,8 +1,8 @@
-"""Log of requests and of administration: a line of JSON per event, without observations and never with a key in it.
+"""Log of requests and of administration: a line of JSON per event, never with observations or keys.
 
-Requests that fail are always written, with their code; `log_requests` adds those that succeed, `log_values` the
-sentences of errors, which name values of observations. Each command of administration, carried out or refused, goes to
-the logger `rlservo.administration`, whatever the log's level is, and to the settings' `audit_file`.
+Requests that fail are always written, with their code; `log_requests` adds those that succeed, `log_values` adds error
+messages, which may quote observations. Each command of administration, carried out or refused, goes to the logger
+`rlservo.administration`, regardless of the log's level, and to the settings' `audit_file`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision
 
 LOGGER = "rlservo"
-FIELDS = "fields"  # where a record carries its fields
+FIELDS = "fields"  # attribute of a record that holds its fields
 LONGEST_ID = 128
 
 _requests = logging.getLogger(f"{LOGGER}.requests")
@@ -53,7 +53,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def configure(settings: ServerSettings, *, replica: str = "") -> None:
-    """Send this process's log, in JSON, to the settings' file or to standard error. Raises UsageError."""
+    """Send this process's log as JSON to the settings' file or to standard error. Raises UsageError."""
     handler: logging.Handler
     handler = logging.StreamHandler(sys.stderr) if settings.log_file is None else logging.FileHandler(settings.log_file)
     handler.setFormatter(JsonFormatter(replica))
@@ -68,7 +68,7 @@ def configure(settings: ServerSettings, *, replica: str = "") -> None:
 
 
 def _log_administration(settings: ServerSettings, replica: str) -> None:
-    """Write who administers whatever the log's level, and to the audit's file if there is one."""
+    """Log administration at any log level, and to the audit file if there is one."""
     administration.setLevel(logging.INFO)
     for previous in list(administration.handlers):
         administration.removeHandler(previous)
@@ -83,20 +83,20 @@ def _log_administration(settings: ServerSettings, replica: str) -> None:
 
 
 class RequestLog:
-    """Writes what became of requests."""
+    """Writes the outcome of requests."""
 
     def __init__(self, settings: ServerSettings) -> None:
         self.every = settings.log_requests
         self._values = settings.log_values
 
     def write_answer(self, request: Request, decision: Decision, seconds: float) -> None:
-        """Write a request that got its action; ask `every` before."""
+        """Write a request that got its action; check `every` first."""
         fields = _fields(request, decision.name, decision.version, "ok", seconds)
         fields["batch"] = decision.batch or 1
         _requests.info("answered", extra={FIELDS: fields})
 
     def write_failure(self, request: Request, code: str, sentence: str, *, peer: str | None = None) -> None:
-        """Write a request that got none; `peer` is the client's address, of one that was not routed."""
+        """Write a request that got no action; `peer` is the client's address, given if it was not routed."""
         if not _requests.isEnabledFor(logging.INFO):
             return
         version = request.version and request.version[:32]
@@ -127,13 +127,13 @@ def _shorten(request_id: str | None) -> str | None:
 
 
 OK = "ok"
-UNANSWERED = "unanswered"  # its client went, or the replica ended: a change may or may not have been made
-LONGEST = 256  # characters of what a client chose
+UNANSWERED = "unanswered"  # its client hung up, or the replica ended: the change may or may not have been made
+LONGEST = 256  # characters of a text that a client chose
 
 
 @dataclass
 class AuditEntry:
-    """One request, and what became of it."""
+    """One request and its outcome."""
 
     method: str
     path: str
@@ -141,18 +141,18 @@ class AuditEntry:
     request_id: str | None
     is_administration: bool = False
     key: str = ""
-    """The label of its key; empty where none was accepted."""
+    """The label of its key; empty if none was accepted."""
     command: str = ""
     policy: str = ""
     version: str | None = None
     change: str = ""
-    """The command as a person would write it."""
+    """The command as a user would type it."""
     code: str = ""
-    """`ok`, or the error's."""
+    """`ok`, or the error's code."""
     generation: int | None = None
 
     def write(self) -> None:
-        """Write the line, if it is for a command: what only reads is none, unless it was refused."""
+        """Write the line for a command; reading is not a command, unless it was refused."""
         if not self.is_administration or (self.method in ("GET", "HEAD", "OPTIONS") and self.code in ("", OK)):
             return
         code = self.code or UNANSWERED
@@ -174,5 +174,5 @@ class AuditEntry:
 
 
 def _safe(text: str) -> str:
-    """Return a client's text, shortened; who sends a key in the wrong place does not find it in the log."""
+    """Return a client's text, shortened; a key sent in the wrong place does not reach the log."""
     return without_keys(text[:LONGEST])

@@ -1,9 +1,8 @@
-"""Prometheus metrics of one process, and of all workers of a server where several share a folder.
+"""Prometheus metrics of one process, or of all workers of a server if they share a folder.
 
-Histograms are prometheus_client's own and take a value at once. What the server counts in plain numbers,
-`sampled_metrics.py` copies into counters and gauges. Every series has the label `replica`, the process that counted it:
-where PROMETHEUS_MULTIPROC_DIR names a folder, the client library keeps values in files there and each worker answers
-for all.
+Histograms are prometheus_client's own and take values directly. `sampled_metrics.py` copies the server's plain numbers
+into counters and gauges. Every series has the label `replica`, the process that counted it: if PROMETHEUS_MULTIPROC_DIR
+names a folder, the client library keeps values in files there and each worker answers for all.
 
 Names follow Prometheus' conventions (base units, `_total`).
 """
@@ -29,8 +28,8 @@ from prometheus_client.registry import Collector
 from rlservo.serve_app.versions.policy_store import Decision
 
 FOLDER_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"  # read by prometheus_client when it is imported
-IDLE = "idle"  # what a stream is closed with that was silent for too long
-SUCCESS = "success"  # the final status of an episode that reached its goal, as the environments say it
+IDLE = "idle"  # close code of a stream that was silent for too long
+SUCCESS = "success"  # the environments' final status of an episode that reached its goal
 SECONDS = (1e-5, 2.5e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0)
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
 DIFFERENCES = (1e-6, 1e-5, 1e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
@@ -38,7 +37,7 @@ DIFFERENCES = (1e-6, 1e-5, 1e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.
 
 @contextlib.contextmanager
 def shared_by_workers() -> Iterator[None]:
-    """Have worker processes that are started meanwhile share their metrics; the files are removed at the end."""
+    """Let worker processes started inside this context share their metrics; the files are removed at the end."""
     with tempfile.TemporaryDirectory(prefix="rlservo-metrics-") as folder:
         os.environ[FOLDER_VARIABLE] = folder
         try:
@@ -49,7 +48,7 @@ def shared_by_workers() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Totals:
-    """Answers of one policy's version since the start, over all protocols."""
+    """Answers of one version of a policy since the start, over all protocols."""
 
     requests: int
     failures: int
@@ -60,7 +59,7 @@ class Totals:
 
 
 class Answers:
-    """Answered requests to one policy's version over one protocol."""
+    """Answered requests to one version of a policy over one protocol."""
 
     __slots__ = ("batch", "count", "inference", "last_s", "latency", "observations")
 
@@ -85,25 +84,25 @@ class Metrics(Collector):
             labels = ["replica", "policy", "version", last_label]
             return Histogram(name, documentation, labels, buckets=bounds, registry=registry)
 
-        latency = "From the first byte to the answer, of requests that got one"
+        latency = "Time from a request's first byte to its answer"
         self._latency = histogram("rlservo_request_seconds", latency, "protocol", SECONDS)
-        inference = "Checking the observation, running the network, checking the action"
+        inference = "Time to check the observation, run the network and check the action"
         self._inference = histogram("rlservo_inference_seconds", inference, "protocol", SECONDS)
-        batch = "Observations per request, of requests that bring a batch"
+        batch = "Observations per batch request"
         self._batch = histogram("rlservo_batch_size", batch, "protocol", BATCHES)
         difference = (
-            "Largest difference between a shadow's action and the one sent, over the elements, in their own units"
+            "Largest difference of any element between a shadow's action and the one sent, in the element's unit"
         )
         self._difference = histogram("rlservo_shadow_difference", difference, "shadow", DIFFERENCES)
         self.sampled = Sampled(replica)
         self.answers: dict[tuple[str, str, str], Answers] = {}  # by policy, version, protocol
-        self.failures: dict[tuple[str, str, str, str], int] = {}  # by these and the error's code
+        self.failures: dict[tuple[str, str, str, str], int] = {}  # by the same and the error's code
         self.streams: dict[str, int] = {}  # by policy
         self.ends: dict[tuple[str, str, bool], int] = {}  # by policy, version and success
 
     @property
     def is_shared(self) -> bool:
-        """Whether several workers answer for each other's metrics."""
+        """Whether several workers share their metrics."""
         return self._folder is not None
 
     def record_answer(self, protocol: str, decision: Decision, seconds: float) -> None:
@@ -123,12 +122,12 @@ class Metrics(Collector):
         answers.last_s = time.time()
 
     def count_failure(self, protocol: str, policy: str, version: str, code: str) -> None:
-        """Count a request that got none; `policy` is empty unless it is loaded: clients must not make up labels."""
+        """Count a request that got no action; `policy` is empty unless loaded: clients must not invent labels."""
         key = (policy, version, protocol, code)
         self.failures[key] = self.failures.get(key, 0) + 1
 
     def count_end(self, decision: Decision, status: str) -> None:
-        """Count an episode whose end a client reported. Its word is free: it counts as `success` or as another."""
+        """Count an episode whose end a client reported. Its status is free text: counted as `success` or as another."""
         key = (decision.name, decision.version, status == SUCCESS)
         self.ends[key] = self.ends.get(key, 0) + 1
 
@@ -143,11 +142,11 @@ class Metrics(Collector):
             histogram.observe(difference)
 
     def requests(self, policy: str, version: str) -> int:
-        """Return how many requests to a version this process has answered, over all protocols."""
+        """Return the number of requests to a version that this process has answered, over all protocols."""
         return sum(answers.count for key, answers in self.answers.items() if key[:2] == (policy, version))
 
     def totals(self, policy: str, version: str) -> Totals:
-        """Return the sums over a version's requests; what failed without asking for an action does not count."""
+        """Return the sums over a version's requests; failures that did not ask for an action do not count."""
         found = [answers for key, answers in self.answers.items() if key[:2] == (policy, version)]
         failed = (count for key, count in self.failures.items() if key[:2] == (policy, version) and key[3] != IDLE)
         return Totals(
@@ -166,8 +165,8 @@ class Metrics(Collector):
         return generate_latest(registry)
 
     def collect(self) -> Iterator[Metric]:
-        """Yield the families as they are now."""
-        # Counters come first here and there: no answer is counted before it is timed.
+        """Yield the current metric families."""
+        # Counters come first here and in the files: no answer is counted before it is timed.
         own = itertools.chain(self.sampled.registry.collect(), self._registry.collect())
         for family in own if self._folder is None else _of_all_workers(Path(self._folder)):
             family.samples = [
@@ -189,7 +188,7 @@ class Sampled:
         self._now: dict[tuple[str, ...], float] = {}
 
     def counter(self, name: str, documentation: str, total: float, **labels: str) -> None:
-        """Raise a counter to a total; one that is smaller than before has begun again from zero."""
+        """Raise a counter to a total; a smaller total than before has restarted from zero."""
         key = (name, *labels.values())
         counted = self._counted.get(key)
         if counted == total:
@@ -213,7 +212,7 @@ class Sampled:
         self._gauges[name].labels(self._replica, *key[1:]).set(value)
 
     def end_round(self) -> None:
-        """Take off the gauges that were not set since the last round."""
+        """Remove the gauges that were not set since the last round."""
         for name, *labels in self._before:
             # In files a series cannot be removed; `Metrics.collect` leaves these out.
             self._gauges[name].labels(self._replica, *labels).set(math.nan)
@@ -226,7 +225,7 @@ def _sum_of(histogram: Histogram) -> float:
 
 
 def _of_all_workers(folder: Path) -> Iterable[Metric]:
-    """Return the families in the files of the workers that run; the files of those that died are removed."""
+    """Return the families from the files of running workers; the files of dead ones are removed."""
     living = []
     for file in sorted(folder.glob("*.db")):  # such as histogram_4711.db; those of counters come first
         if psutil.pid_exists(int(file.stem.rpartition("_")[2])):
@@ -235,6 +234,6 @@ def _of_all_workers(folder: Path) -> Iterable[Metric]:
             file.unlink(missing_ok=True)
     try:
         families: Iterable[Metric] = MultiProcessCollector.merge(living)  # type: ignore[no-untyped-call]
-    except FileNotFoundError:  # of a worker that died just now
+    except FileNotFoundError:  # of a worker that has just died
         return _of_all_workers(folder)
     return families

@@ -1,4 +1,4 @@
-"""Commands of `rlservo policy` on a repository itself, without a server: proven here, followed by all that serve it."""
+"""Commands of `rlservo policy` on a repository, without a server: proven here; servers of the repository follow."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from rlservo.serve_app.versions.serving_plan import Plan
 
 
 class OfflineCommands:
-    """Commands of `AdminClient` without a server. Each raises what is wrong with the repository or the command."""
+    """Commands of `AdminClient` without a server. Each raises an error for a fault of the repository or the command."""
 
     def __init__(self, places: Sequence[str]) -> None:
-        """The places are what `rlservo serve` is given, in the same order. Raises UsageError."""
+        """Take the places that `rlservo serve` gets, in the same order. Raises UsageError."""
         settings = ServerSettings.from_environment()
         self._files = plan_files(places, settings)
         self._loader = version_loader(places, settings)
 
     def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
-        """Carry out a command on a policy; return what is served of it then, as the server would."""
+        """Carry out a command on a policy; return its new listing, as the server would."""
         try:
             given = parse(command, document)
         except RequestError as error:

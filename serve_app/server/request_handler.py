@@ -1,10 +1,10 @@
-"""Handling of a request, whatever its protocol: received, admitted, parsed, decided, encoded; counted, logged, timed.
+"""Handling of a request of any protocol: receive, admit, parse, decide, encode; count, log and time.
 
 A protocol is a `Codec` and a transport. The transport (`http_endpoint.py`, `websocket_stream.py`, `oip_grpc.py`) makes
-a `Request` and calls `RequestHandler.answer`, which calls the codec; what it raises the transport encodes as an error.
+a `Request` and calls `RequestHandler.answer`, which calls the codec; the transport encodes its exceptions as errors.
 
-A decision runs in the event loop from its first line to its last. So requests do not wait for each other in a queue of
-ours: they wait as tasks that the loop has made and not yet run.
+A decision runs in the event loop from its first line to its last. So requests do not wait in a queue of ours: they wait
+as tasks that the loop has created and not yet run.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 STRICTER = "stricter-than-production"
-"""Counted for `bad-observation` where the version that production leads to takes the observation."""
-NO_EXPLORING = "this API key may not ask for exploring actions: leave 'explore' out, or use a key of the role 'explore'"
-BUG = "the server failed on this request; its log says how"
+"""Counted instead of `bad-observation` if the version in production accepts the observation."""
+NO_EXPLORING = "this API key may not request exploring actions: leave 'explore' out, or use a key of role 'explore'"
+BUG = "the server failed on this request; its log has the cause"
 
 StoreProvider = Callable[[], PolicyStore | None]
 Source = TypeVar("Source", contravariant=True)
@@ -57,7 +57,7 @@ Reply = TypeVar("Reply", covariant=True)
 
 
 class Codec(Protocol[Source, Reply]):
-    """Bytes of one protocol: from what a transport reads from, and to what it writes."""
+    """Bytes of one protocol: decoded from a transport's source, and encoded for its reply."""
 
     async def receive(self, request: Request, source: Source) -> Any:
         """Return the content, read within its limits. Raises RlservoError, and ClientGoneError."""
@@ -73,7 +73,7 @@ class Codec(Protocol[Source, Reply]):
 
 
 class RequestHandler:
-    """Answers requests, and is the one place that admits, counts, logs and times them; every protocol has the same."""
+    """Answers requests of every protocol; the only place that admits, counts, logs and times them."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class RequestHandler:
             self.episodes.marks_states = True
 
     async def close(self) -> None:
-        """Close connections to other services."""
+        """Close the connections to other services."""
         if self.episodes.store is not None:
             await self.episodes.store.close()
 
@@ -132,7 +132,7 @@ class RequestHandler:
             return False
 
     def policies(self) -> Iterator[tuple[str, str, Policy]]:
-        """Yield (name, version, policy) of all that are loaded."""
+        """Yield (name, version, policy) of every loaded version."""
         store = self._store_provider()
         if store is not None:
             for name in store.names:
@@ -147,14 +147,14 @@ class RequestHandler:
         return store
 
     async def answer(self, codec: Codec[Source, Reply], request: Request, source: Source) -> Reply:
-        """Return the reply. What the codec reads it reads from `source`.
+        """Return the reply; the codec reads from `source`.
 
         Raises RlservoError, which has been counted and logged, and ClientGoneError.
         """
         try:
             content = await codec.receive(request, source)
             self._admit(request)
-            self.store()  # not ready comes before any fault of the request
+            self.store()  # being not ready takes precedence over any fault of the request
             codec.parse(request, content)
             if request.explore and not request.may_explore:
                 raise ForbiddenError(NO_EXPLORING)
@@ -194,7 +194,7 @@ class RequestHandler:
         """
         store, name, obs = self.store(), request.policy, request.obs
         if request.deadline_ms is not None and (time.perf_counter() - request.received) * 1e3 >= request.deadline_ms:
-            check_deadline(request)  # raises: it is later by now
+            check_deadline(request)  # raises: time has passed since
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
@@ -219,10 +219,10 @@ class RequestHandler:
         asked: str | None = None,
         counted_as: str | None = None,
     ) -> None:
-        """Count and log a request that got no action; names that are not loaded share one count.
+        """Count and log a request that got no action; requests for unknown names share one count.
 
-        `peer` is the address it came from, for the log of what was refused before it was routed; `asked` is the version
-        that was asked and failed, where it came so far; `counted_as` is the code in the metrics, where it is another.
+        `peer` is the client's address, logged if the request was refused before it was routed; `asked` is the version
+        that failed, if one was asked; `counted_as` is the code in the metrics, if it differs.
         """
         name, version = request.policy, request.version
         store = self._store_provider()
@@ -230,20 +230,20 @@ class RequestHandler:
             name = version = ""
         elif asked is not None:
             version = asked
-        else:  # an alias is counted as the version it leads to, no version as the default
+        else:  # an alias counts as its version, no version as the default
             version = store.default(name) if version is None else store.version_of(name, version)
         self.metrics.count_failure(request.protocol, name, version, counted_as or code)
         self.log.write_failure(request, code, sentence, peer=peer)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
-        """Count a request that failed by the exception that is being handled, and log that with its traceback."""
+        """Count a request that failed with the current exception, and log its traceback."""
         logger.exception("a request failed", extra={FIELDS: {"request_id": request.request_id}})
-        # Unless a version was asked: what failed may be the policies.
+        # Unless a version was asked: the policies themselves may have failed.
         name, version = ("", "") if asked is None else (request.policy, asked)
         self.metrics.count_failure(request.protocol, name, version, InternalError.code)
 
     def open_stream(self, request: Request) -> None:
-        """Count a stream that opens, from whose opening `request` is. Raises OverloadedError."""
+        """Count a new stream; `request` is its opening request. Raises OverloadedError."""
         try:
             self.admission.open_stream()
         except OverloadedError as error:
@@ -252,31 +252,31 @@ class RequestHandler:
         self.metrics.count_stream(request.policy, 1)
 
     def close_stream(self, request: Request) -> None:
-        """Count it no longer."""
+        """Count one stream less."""
         self.admission.close_stream()
         self.metrics.count_stream(request.policy, -1)
 
     def _count_end(self, request: Request, decision: Decision, status: str) -> None:
-        """Count an episode that ended, unless chance gave its requests to one version or another."""
+        """Count an episode that ended, unless its requests were divided between versions at random."""
         carries_state = decision.episode is not None and decision.episode.state is not None
         drawn = request.version is None and not carries_state and self.store().is_drawn(decision.name, request.label)
         if not drawn and not decision.is_repeat:
             self.metrics.count_end(decision, status)
 
     def _admit(self, request: Request) -> None:
-        """Raise OverloadedError or LateError; a wait before `received` begins to count."""
-        if request.stream_id is not None:  # request and reply alternate there, so that the streams' number is the bound
+        """Raise OverloadedError or LateError; waiting before `received` counts as well."""
+        if request.stream_id is not None:  # requests and replies alternate there, so the number of streams is the bound
             if not request.is_fresh:
                 self.admission.check_age()
             return
-        # Only now, when the body is here: one that is slow to come waits for itself.
+        # Only now that the body is here: a client that sends slowly delays only itself.
         request.received = min(request.received, self.admission.enter())
 
     def _counted_as(self, request: Request, error: RlservoError) -> str:
-        """Return what a failure is counted as: its code, or STRICTER where the version that was asked is at fault.
+        """Return the code to count for a failure: its own, or STRICTER if the version that was asked is at fault.
 
-        Most observations that a version refuses every version would, and they say nothing of it. One that production
-        takes does, even where the refusal is what the version's contract says.
+        Most observations that a version refuses would be refused by every version, and say nothing about it. One that
+        production accepts does, even if the version's contract demands the refusal.
         """
         version, store = blamed_version(error), self._store_provider()
         if version is None or store is None or not isinstance(error, ObservationError):
@@ -289,8 +289,8 @@ class RequestHandler:
         return error.code
 
     async def _decide_non_finite(self, request: Request) -> Decision:
-        """Refuse what JSON does not have, by the sentence of the element where it is one of the observation's."""
-        if request.episode is None:  # else a session would move on
+        """Refuse numbers that JSON lacks, naming the element if it is one of the observation's."""
+        if request.episode is None:  # otherwise a session would advance
             try:
                 await self.decide(request)
             except ObservationError as error:
@@ -304,17 +304,17 @@ class RequestHandler:
 
 
 def _check_names(request: Request) -> None:
-    """Refuse a key where an episode's name or end belongs: recordings, metrics and logs would have it."""
+    """Refuse an API key in an episode's name or end, which would reach recordings, metrics and logs."""
     episode = request.episode or Episode()
     said = {"x-session-id": request.label, "session_id": episode.session_id, "final_status": episode.final_status}
     for name, text in said.items():
         if type(text) is str and A_KEY.search(text):
             request.label = request.episode = None
-            raise RequestError(f"'{name}' holds an API key, which would be recorded: send a name of your own")
+            raise RequestError(f"'{name}' holds an API key, which would be recorded: send another name")
 
 
 def _session_store(settings: ServerSettings) -> RedisSessions | None:
-    """Return the store of sessions that several processes share, where one is set. Raises UsageError."""
+    """Return the session store that several processes share, if one is set. Raises UsageError."""
     if settings.session_store == MEMORY:
         return None
     from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only servers with several workers need it

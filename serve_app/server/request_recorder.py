@@ -1,7 +1,7 @@
-"""Recording of what the server decides: each answer, what clients say came of it, and requests that got no action.
+"""Recording of the server's decisions: each answer, the outcome reported by clients, and requests without an action.
 
-The request path leaves a note; the record is made of it when the reply has been written, in the event loop's next turn,
-and `recording/recorder.py` writes it in a thread. A fault in here costs records, and no request.
+The request path leaves a note; the record is made from it after the reply was written, in the event loop's next turn,
+and `recording/recorder.py` writes it in a thread. A fault here costs records, never a request.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ with needs_extra("record", what="recording"):
 
 logger = logging.getLogger(__name__)
 
-MOST_EPISODES = 65_536  # whose steps are counted; of more, the one that was silent longest starts over
-LONGEST_REQUEST_ID = 128  # of a longer one, the beginning: a header may have 16 KB
+MOST_EPISODES = 65_536  # whose steps are counted; beyond it, the one that was silent longest starts over
+LONGEST_REQUEST_ID = 128  # longer ones are cut: a header may have 16 KB
 NO_EPISODE = Episode()
 
 
@@ -54,27 +54,27 @@ class RequestRecorder:
         )
         self._formats: WeakKeyDictionary[Policy, PolicyFormat] = WeakKeyDictionary()
         self._steps: OrderedDict[tuple[str, str], int] = OrderedDict()
-        """The last recorded step of each episode, by policy name and episode; the longest silent come first."""
+        """The last recorded step of each episode, by policy name and episode; those silent longest come first."""
         self._notes: deque[Callable[[], None]] = deque()
-        """Of requests whose records are still to be made."""
+        """Requests whose records are still to be made."""
         self._lock = threading.Lock()
         self._has_failed = False
 
     def note_answer(self, request: Request, decision: Decision, taken_s: float) -> None:
-        """Record a decision, and what its request says of the one before, when the reply has been written."""
+        """Record a decision, and the outcome in its request of the one before, once the reply has been written."""
         policy = decision.policy
         if policy.options.record and not decision.is_repeat:
-            draw = policy.draw if request.explore else None  # the next request's takes its place
+            draw = policy.draw if request.explore else None  # the next request's one replaces it
             self._note(partial(self._record_answer, request, decision, taken_s, draw))
 
     def note_failure(self, request: Request, store: PolicyStore | None, error: RlservoError) -> None:
-        """Record a single observation that got no action, where it is one of the policy's at all."""
+        """Record a single observation that got no action, if it fits the policy."""
         if store is not None and request.obs is not None and not isinstance(error, ObservationError | RequestError):
             taken_ms = (time.perf_counter() - request.received) * 1e3
             self._note(partial(self._record_failure, request, store, error.code, taken_ms))
 
     def close(self) -> None:
-        """Write what there is and end the file."""
+        """Write the remaining records and end the file."""
         self._make_records()
         self.recorder.close()
 
@@ -89,7 +89,7 @@ class RequestRecorder:
                 make_record = self._notes.popleft()
                 try:
                     make_record()
-                except Exception:  # ours: nothing of a request comes this far unchecked
+                except Exception:  # a bug of ours: everything in a request was checked before
                     self.recorder.dropped += 1
                     if not self._has_failed:
                         self._has_failed = True
@@ -100,7 +100,7 @@ class RequestRecorder:
         said = request.episode or NO_EPISODE
         episode, step = self._place(request, decision, said)
         known, rows = self._format(policy), decision.batch or 1
-        # Copies: what came in binary is a view of the whole request's body, which may be a thousand times as large.
+        # Copies: binary input is a view of the whole request's body, which may be a thousand times as large.
         obs = LeafArrays({name: decision.inputs[name].copy() for name in known.observations.leaves})
         ends = said.final_status is not None
         reward = None if said.reward is None else _numbers(said.reward, rows)
@@ -128,7 +128,7 @@ class RequestRecorder:
     def _record_failure(self, request: Request, store: PolicyStore, code: str, taken_ms: float) -> None:
         said = request.episode or NO_EPISODE
         if said.final_status is not None:
-            return  # no decision was asked for, and the episode continues until its end is reported
+            return  # no decision was requested; the episode continues until its end is reported
         session_id = said.session_id
         label = request.label if session_id is None else str(session_id)
         try:
@@ -143,7 +143,7 @@ class RequestRecorder:
             return
         try:
             arrays = known.observations.arrays(request.obs)
-        except Exception:  # it may be anything: nothing has looked at it yet
+        except Exception:  # it may be anything: it has not been checked yet
             return
         episode = "" if _carries_state(request) else _episode_of(request)
         step = self._count(policy.contract.name, episode, said.reset) if episode else 0
@@ -161,7 +161,7 @@ class RequestRecorder:
         episode = _episode_of(request)
         if not episode:
             return "", 0
-        # A memory that continues does not begin an episode, whatever was reported of its end or forgotten here.
+        # A memory that continues does not begin an episode, even if its end was reported or it was forgotten here.
         least = note.step - 1 if note is not None and note.step is not None and decision.policy.is_stateful else 0
         step = self._count(decision.name, episode, said.reset, least)
         if said.end or said.final_status is not None:
@@ -187,7 +187,7 @@ class RequestRecorder:
 
 
 def _episode_of(request: Request) -> str:
-    """Return the episode that a request is of: its session, its stream, or all that comes under its label."""
+    """Return a request's episode: its session, its stream, or everything under its label."""
     return _session_of(request) or request.stream_id or shorten_label(request.label or "")
 
 
@@ -195,7 +195,7 @@ def _session_of(request: Request) -> str | None:
     if request.episode is None or request.episode.session_id is None:
         return None
     session_id = request.episode.session_id
-    return session_id if isinstance(session_id, str) else f"#{session_id}"  # 7 and "7" are two sessions
+    return session_id if isinstance(session_id, str) else f"#{session_id}"  # 7 and "7" are different sessions
 
 
 def _request_id(request: Request) -> str | None:
@@ -203,7 +203,7 @@ def _request_id(request: Request) -> str | None:
 
 
 def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:
-    """Return a request's reward, or one a row; None for what is none."""
+    """Return a request's reward, or one per row; None if it is not a number."""
     try:
         numbers = parse_array(reward, "float64", "the reward").ravel()
     except RequestError:

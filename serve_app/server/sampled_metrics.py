@@ -27,11 +27,11 @@ async def exposition(handler: RequestHandler) -> bytes:
 
 
 async def keep_sampled(handler: RequestHandler) -> None:
-    """Sample until it is cancelled, for the other workers to read."""
+    """Sample until cancelled, for the other workers to read."""
     while True:
         try:
             sample(handler)
-        except Exception:  # a fault in one metric must not freeze all others
+        except Exception:  # a fault in one metric must not stop the others
             logger.exception("the metrics could not be sampled")
         await asyncio.sleep(EVERY_S)
 
@@ -44,7 +44,7 @@ def sample(handler: RequestHandler) -> None:
 
 
 def requests(handler: RequestHandler) -> None:
-    """Sample what was counted of requests, streams and episodes."""
+    """Sample the counts of requests, streams and episodes."""
     metrics, show = handler.metrics, handler.metrics.sampled
     outcomes = {(*key, "ok"): answers.count for key, answers in metrics.answers.items()} | metrics.failures
     for (policy, version, protocol, code), count in outcomes.items():
@@ -54,11 +54,11 @@ def requests(handler: RequestHandler) -> None:
         show.gauge("rlservo_streams", "Open WebSockets", count, policy=policy)
     for (policy, version, succeeded), count in metrics.ends.items():
         which = {"policy": policy, "version": version, "outcome": SUCCESS if succeeded else "other"}
-        show.counter("rlservo_episode_ends", "Episodes whose end clients reported (`final_status`)", count, **which)
+        show.counter("rlservo_episode_ends", "Episodes whose end a client reported (`final_status`)", count, **which)
 
 
 def versions(handler: RequestHandler) -> None:
-    """Sample the plan that this process follows, and of each version whether it is the default, batches and drift."""
+    """Sample the plan that this process follows, and each version's default flag, batches and drift."""
     show = handler.metrics.sampled
     if handler.control is not None and handler.control.plan is not None:
         show.gauge("rlservo_plan_generation", "Plan that this process follows", handler.control.plan.generation)
@@ -68,43 +68,43 @@ def versions(handler: RequestHandler) -> None:
         drift = policy.drift
         if drift is None:
             continue
-        show.counter("rlservo_observation_looks", "Observations looked at for drift", drift.looks, **which)
+        show.counter("rlservo_observation_looks", "Observations checked for drift", drift.looks, **which)
         elements, moved, varied = drift.elements if drift.looks else (), drift.shift, drift.spread
         if len(elements) > MAX_ELEMENTS:
             elements, moved, varied = (LARGEST,), moved[[np.argmax(np.abs(moved))]], varied[[np.argmax(varied)]]
         for element, mean, deviation in zip(elements, moved.tolist(), varied.tolist()):  # noqa: B905 - none before a look
-            shift = "Mean of an observation's element, from its mean in training, in training's standard deviations"
+            shift = "Shift of an observation element's mean from training's, in training's standard deviations"
             show.gauge("rlservo_observation_shift", shift, mean, **which, element=element)
-            spread = "Standard deviation of an observation's element, relative to training"
+            spread = "Standard deviation of an observation element, relative to training"
             show.gauge("rlservo_observation_spread", spread, deviation, **which, element=element)
 
 
 def queue(handler: RequestHandler) -> None:
-    """Sample what waits for this process."""
+    """Sample the requests that wait for this process."""
     admission, show = handler.admission, handler.metrics.sampled
-    waited = "Most requests that waited for the processor at once, since the start"
+    waited = "Largest number of requests that waited for the processor at once, since the start"
     show.gauge("rlservo_queue_longest", waited, admission.longest)
-    show.gauge("rlservo_requests_incoming", "Requests whose body is on its way", admission.incoming)
+    show.gauge("rlservo_requests_incoming", "Requests whose body is still arriving", admission.incoming)
 
 
 def keys(handler: RequestHandler) -> None:
-    """Sample whether the API keys in use are those of their file, and the refusals by rate."""
+    """Sample whether the API keys in use are those of their file, and the refusals by rate limit."""
     show = handler.metrics.sampled
-    current = "1 while the API keys in use are those of their file; 0: the file cannot be used, and older keys stay"
+    current = "1 while the API keys in use are those of their file; 0 if older keys stay in use"
     show.gauge("rlservo_api_keys_current", current, handler.keys.current)
     for label, count in handler.keys.limits.refused.items():
-        show.counter("rlservo_rate_limited", "Requests refused because their key asked too often", count, key=label)
+        show.counter("rlservo_rate_limited", "Requests refused because their key exceeded its rate", count, key=label)
 
 
 def recording(handler: RequestHandler) -> None:
-    """Sample what is recorded and what is missing, where a recording was asked for."""
+    """Sample the recorded and missing decisions, if recording is on."""
     if handler.recorder is None:
         return
     recorder, show = handler.recorder.recorder, handler.metrics.sampled
-    goes_on = "1 while decisions are recorded; 0: the folder could not be written to"
+    goes_on = "1 while decisions are recorded; 0 if the folder cannot be written"
     show.gauge("rlservo_recording", goes_on, recorder.failure is None)
-    show.counter("rlservo_records_written", "Decisions, and what came of them, in the recording", recorder.written)
-    show.counter("rlservo_records_dropped", "Decisions that the recording's buffer had no room for", recorder.dropped)
+    show.counter("rlservo_records_written", "Decisions and outcomes in the recording", recorder.written)
+    show.counter("rlservo_records_dropped", "Decisions dropped by a full recording buffer", recorder.dropped)
 
 
 def sessions(handler: RequestHandler) -> None:
@@ -112,18 +112,18 @@ def sessions(handler: RequestHandler) -> None:
     episodes, kept, show = handler.episodes, handler.episodes.sessions, handler.metrics.sampled
     now = kept.count()
     for name in sorted({*now, *episodes.begun, *episodes.lost}):
-        show.gauge("rlservo_sessions", "Sessions kept under an id in this process", now[name], policy=name)
-        show.counter("rlservo_sessions_begun", "Sessions begun under an id", episodes.begun[name], policy=name)
+        show.gauge("rlservo_sessions", "Sessions in this process", now[name], policy=name)
+        show.counter("rlservo_sessions_begun", "Sessions begun", episodes.begun[name], policy=name)
         show.counter("rlservo_sessions_evicted", "Sessions forgotten when idle", kept.evicted[name], policy=name)
-        show.counter("rlservo_sessions_lost", "Requests whose session is not here", episodes.lost[name], policy=name)
+        show.counter("rlservo_sessions_lost", "Requests for unknown sessions", episodes.lost[name], policy=name)
     if episodes.store is not None:
-        failed = "Reads and writes of sessions that Redis did not carry out: such requests are answered 503"
+        failed = "Failed reads and writes of sessions in Redis; the requests were answered with 503"
         show.counter("rlservo_session_store_failures", failed, episodes.store.unreachable)
     show.gauge("rlservo_episodes_remembered", "Episodes in memory, in sessions and on streams", kept.rows)
 
 
 def shadows(handler: RequestHandler) -> None:
-    """Sample the actions that shadows are not compared by."""
+    """Sample the actions without a shadow's comparison."""
     for policy, version, shadow, reason, count in handler.shadows.missed():
         which = {"policy": policy, "version": version, "shadow": shadow, "reason": reason}
-        handler.metrics.sampled.counter("rlservo_shadow_missed", "Actions without a comparison", count, **which)
+        handler.metrics.sampled.counter("rlservo_shadow_missed", "Actions not compared with a shadow's", count, **which)

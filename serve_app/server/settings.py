@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rlservo.export.contract.bundle import BundleLimits
 
 PREFIX = "RLSERVO_"
-MEMORY = "memory"  # of this process: where sessions are kept by default
+MEMORY = "memory"  # this process's memory, where sessions are kept by default
 
 
 class ServerSettings(BaseModel):
@@ -34,15 +34,15 @@ class ServerSettings(BaseModel):
     """onnxruntime threads per session; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
 
     max_body_bytes: int = Field(4 << 20, ge=1024)
-    """A larger request body is refused with 413 before it is read to the end; so is, unparsed, a request for actions
-    that is larger than `max_batch` observations of its policy can need."""
+    """A larger request body is refused with 413 before it is read to the end. A request for actions that is larger than
+    `max_batch` observations of its policy need is refused unparsed."""
 
     max_batch: int = Field(4096, ge=1)
     """More observations in one request are refused with 413: the event loop computes a batch in one go."""
 
     body_timeout_s: float = Field(2.0, gt=0, allow_inf_nan=False)
-    """[s] A client that takes longer to send its body gets 408 (embedded server; on a cluster nginx or an Ingress must
-    do it)."""
+    """[s] A client that takes longer to send its body gets 408 (embedded server; on a cluster, nginx or an Ingress must
+    do this)."""
 
     max_ongoing_requests: int = Field(128, ge=1)
     """Most requests that may wait for one process; further ones get 503 immediately."""
@@ -57,7 +57,7 @@ class ServerSettings(BaseModel):
     """Most streams (WebSocket, gRPC) that may be open, per process."""
 
     max_connections_per_address: int = Field(1024, ge=0)
-    """Most connections of one client address to a process of the embedded server, of 4096 altogether; further ones get
+    """Most connections from one client address to a process of the embedded server, of 4096 in total; further ones get
     429, many more are closed at once. 0: no bound, for a server behind a proxy."""
 
     trusted_proxies: str = ""
@@ -65,28 +65,28 @@ class ServerSettings(BaseModel):
     client, for the log and the bound above; none by default."""
 
     grpc_reflection: bool = False
-    """Answer gRPC's reflection service, by which grpcurl and others find methods and messages (embedded server)."""
+    """Answer gRPC's reflection service, with which grpcurl and others find methods and messages (embedded server)."""
 
     stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A stream (WebSocket, gRPC) that was silent for this long is closed."""
 
     api_keys_file: str | None = None
-    """File of the API keys' hashes, a line each: `<label> <act|explore|admin> sha256:<hash>`; `rlservo key` makes
-    them."""
+    """File with the hashes of the API keys, one per line: `<label> <act|explore|admin> sha256:<hash>`; `rlservo key`
+    makes the lines."""
 
     api_keys: str = Field("", repr=False)
-    """The same lines, separated by commas, if a variable is easier to set than a file."""
+    """The same lines, separated by commas, for setups where a variable is easier than a file."""
 
     operator_key: str = Field("", repr=False, pattern=r"^(sha256:[0-9a-f]{64})?$")
-    """`sha256:<hash>` of a key for administration alone; unlike `api_keys` it leaves other clients without one."""
+    """`sha256:<hash>` of a key for administration; unlike `api_keys`, it does not make other clients need a key."""
 
     allow_unauthenticated: bool = False
-    """Listen beyond this machine without any key: anyone who can reach the port can request actions."""
+    """Accept requests from other machines without any key: anyone who can reach the port can request actions."""
 
     allowed_hosts: str = ""
-    """Names, separated by commas, that requests may use for this server besides `localhost`, the address listened on
-    and, beyond this machine, every address and the machine's own name; `*` is any. A server beyond this machine with
-    API keys takes any name unless some are given here: a web page whose name leads to it has no key."""
+    """Names, separated by commas, that requests may use for this server besides `localhost`, its own address and, if
+    other machines can reach it, any address and the machine's name; `*` allows any. A server with API keys that other
+    machines can reach takes any name unless some are given here: a web page has no key."""
 
     default_policy: str | None = None
     """Policy of a WebSocket at `/`, where openpi's clients connect; if there is one policy, that one. Also set by
@@ -100,38 +100,38 @@ class ServerSettings(BaseModel):
     machine append to the same one."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
-    """Lowest level that is logged; `info` includes every request that got no action."""
+    """Lowest log level; `info` includes every request that got no action."""
 
     log_requests: bool = False
-    """Also log every request that got its action: a line costs about as much as the policy."""
+    """Also log every request that got its action; a line costs about as much time as the policy."""
 
     log_values: bool = False
-    """Log error messages, which may name values of observations."""
+    """Log error messages, which may quote observations."""
 
     session_store: str = Field(MEMORY, repr=False)  # the URL may hold a password
-    """Place of the sessions that a client names by id: `memory` of the process, or for several workers or replicas
+    """Storage of sessions that clients name by id: `memory` of the process, or for several workers or replicas
     `redis://[USER:PASSWORD@]HOST:PORT/DATABASE` (`rediss://` with TLS, `unix://` for a socket). Each server needs a
     database of its own. Also set by `rlservo serve --session-store`."""
 
     max_sessions: int = Field(1024, ge=1)
-    """Episodes one process remembers at once, in sessions in its memory and on streams (a batch is so many); a further
-    one is answered 503."""
+    """Most episodes that one process remembers at once, in sessions and on streams (each row of a batch is one);
+    further ones get 503."""
 
     session_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
-    """[s] A session without a step for this long is forgotten; a stream's lives as long as the stream."""
+    """[s] A session without a step for this long is forgotten; a stream keeps its episode while it is open."""
 
     policy_options: dict[str, PolicyOptions] = {}
-    """Options of each policy, by policy name; '*' is for the others. As a variable: a JSON object."""
+    """Options of each policy, by policy name; '*' is for the others. The variable takes a JSON object."""
 
     record: str | None = None
-    """Record every decision into this folder, except of policies whose options have `"record": false`. Observations may
-    be private: off by default. Also set by `rlservo serve --record`."""
+    """Record every decision into this folder, except for policies with the option `"record": false`. Off by default, as
+    observations may be private. Also set by `rlservo serve --record`."""
 
     record_file_bytes: int = Field(256 << 20, ge=1 << 20)
-    """A recording continues in a new file at this size, or after an hour."""
+    """A recording continues in a new file after this size, or after an hour."""
 
     record_bytes: int = Field(10 << 30, ge=2 << 20)
-    """The oldest recordings in the folder are deleted beyond it; at least twice `record_file_bytes`."""
+    """Beyond this size the oldest recordings in the folder are deleted; at least twice `record_file_bytes`."""
 
     max_policy_bytes: int = Field(512 << 20, ge=1024)
     """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
@@ -143,23 +143,23 @@ class ServerSettings(BaseModel):
     """A larger contract.json is refused before it is read."""
 
     plan: str | None = None
-    """Folder or URI in whose `.plan` the aliases, canaries and shadows stand. By default the first of the places of
-    policies that can be written, else the user's state folder (`$XDG_STATE_HOME/rlservo`)."""
+    """Folder or URI whose `.plan` holds the aliases, canaries and shadows. By default the first writable place of
+    policies, else the user's state folder (`$XDG_STATE_HOME/rlservo`)."""
 
     load_timeout_s: float = Field(30.0, gt=0, allow_inf_nan=False)
-    """[s] Looking through the places of policies, loading and proving one version, and reading or writing the plan are
-    given up after this time: a file system or storage may hang. One call to object storage may take half of it."""
+    """[s] Time limit for listing the places of policies, loading and proving one version, and reading or writing the
+    plan: a file system or storage may hang. One call to object storage may take half of it."""
 
     cache: str | None = None
-    """Folder of this machine into which versions of remote repositories (`rlservo serve s3://...`) are fetched;
-    replicas share it. `$XDG_CACHE_HOME/rlservo/bundles`, else the same below `~/.cache`, when left out."""
+    """Local folder for versions fetched from remote repositories (`rlservo serve s3://...`); replicas share it. By
+    default `$XDG_CACHE_HOME/rlservo/bundles`, else the same below `~/.cache`."""
 
     cache_bytes: int = Field(10 << 30, ge=1 << 20)
-    """Largest size of the cache: the least recently used versions are removed, those in use never."""
+    """Largest size of the cache: the least recently used versions are removed, never those in use."""
 
     poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
-    """[s] Look through the places of policies this often, and load versions that are newer than those known, as
-    `rlservo policy load` does: ready, not in use. Off by default. Also set by `rlservo serve --poll`."""
+    """[s] How often to look for new versions in the places of policies and load them, as `rlservo policy load` does:
+    ready but not in use. Off by default. Also set by `rlservo serve --poll`."""
 
     @property
     def bundle_limits(self) -> BundleLimits:
@@ -206,7 +206,7 @@ class ServerSettings(BaseModel):
     ) -> Self:
         """Return settings from `given`, then `RLSERVO_*` of the environment, then the defaults.
 
-        Variables of other parts of rlservo share the prefix and are not this class's to judge. Raises UsageError.
+        Variables of other parts of rlservo share the prefix and are ignored. Raises UsageError.
         """
         given = given or {}
         environment = os.environ if environment is None else environment

@@ -1,4 +1,4 @@
-"""Check before a server starts: load and prove all that it would serve."""
+"""Check before a server starts: load and prove everything that it would serve."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rlservo.serve_app.versions.version_loader import VersionLoader
 def load_served(
     paths: Sequence[str | Path], config: ServedConfig, settings: ServerSettings | None = None
 ) -> PolicyStore:
-    """Load and prove what a server of these folders starts with; a repository without a plan gets its first one.
+    """Load and prove the versions that a server of these folders starts with; write a missing plan.
 
     Raises UsageError or BundleError, and UnavailableError if a file system or storage does not answer.
     """
@@ -34,7 +34,7 @@ def load_served(
 
 
 def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> VersionLoader:
-    """Return what loads the versions of these folders and URIs as the settings say. Raises UsageError."""
+    """Return the loader for versions of these folders and URIs, under the settings. Raises UsageError."""
     limits = settings.bundle_limits
     load = partial(Policy.load, threads=settings.threads, limits=limits)
     repository = Repository(
@@ -48,5 +48,5 @@ def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> Ve
 
 
 def plan_files(places: Sequence[str | Path], settings: ServerSettings) -> PlanFiles:
-    """Return where the plan of these folders and URIs is kept, as the settings say. Raises UsageError."""
+    """Return the plan's files for these folders and URIs, under the settings. Raises UsageError."""
     return PlanFiles(places, root=settings.plan, cache=settings.cache, timeout_s=settings.load_timeout_s)

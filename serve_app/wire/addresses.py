@@ -1,4 +1,4 @@
-"""Addresses of servers, and whether only this machine reaches them."""
+"""Server addresses, and whether only this machine can reach them."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from rlservo.export.contract.errors import UsageError
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server that listens on `host`."""
+    """Return whether only this machine can reach a server that listens on `host`."""
     if host == "localhost":
         return True
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:  # a name: wherever it points
+    except ValueError:  # a name may point anywhere
         return False
 
 
 def parse_address(url: str, schemes: Mapping[str, str]) -> str:
-    """Return `url` under the scheme that `schemes` has for its own, without a slash at its end. Raises UsageError."""
+    """Return `url` with its scheme replaced by `schemes`, without a trailing slash. Raises UsageError."""
     parts = urlsplit(url)
     try:
         has_host = bool(parts.hostname) and parts.port != 0
-        host_of(parts)  # UnicodeError, a ValueError: a name that no wire can carry
+        host_of(parts)  # UnicodeError, a ValueError: a name that cannot be encoded
     except ValueError:
         has_host = False
     if parts.scheme not in schemes or not has_host:
@@ -35,5 +35,5 @@ def parse_address(url: str, schemes: Mapping[str, str]) -> str:
 
 
 def host_of(parts: SplitResult) -> bytes:
-    """Return a host as the wire has it."""
+    """Return a host in its encoded form."""
     return (parts.hostname or "").encode("idna")

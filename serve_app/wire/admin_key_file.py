@@ -12,9 +12,9 @@ LONGEST_KEY_FILE = 4096  # [bytes] far more than a key
 
 
 def key_file(port: int) -> Path:
-    """Return where the key of a server on this port is kept.
+    """Return the path of the key file of a server on this port.
 
-    Below XDG_RUNTIME_DIR, else in the user's cache, else (a user without a home) in the folder of temporary files.
+    Below XDG_RUNTIME_DIR, else in the user's cache, else (for a user without a home) in the folder for temporary files.
     """
     name = f"admin-{port}.key"
     folder = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("XDG_CACHE_HOME")

@@ -1,7 +1,7 @@
 """Bounded HTTP connections: one deadline over all reads and writes, through the environment's proxy.
 
-httpcore's time-outs are for each read: a server that sends a byte now and then is waited for without end. A control
-loop's deadline, and that of a call to a storage, is for the whole answer.
+httpcore's time-outs apply to each read: a server that sends a byte now and then can delay a client indefinitely. The
+deadlines of a control loop and of a storage call are for the whole answer.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MOST_HELD = 65536
 
 
 class DeadlineBackend(httpcore.NetworkBackend):
-    """Makes connections that give up at `deadline`, which each thread sets for itself."""
+    """Makes connections that give up at `deadline`, which is set per thread."""
 
     def __init__(self) -> None:
         self._backend = httpcore.SyncBackend()
@@ -55,7 +55,7 @@ class DeadlineBackend(httpcore.NetworkBackend):
         self._local.deadline = value
 
     def remaining(self, timeout: float | None, kind: type[Exception]) -> float | None:
-        """Return the time left of `timeout` and the deadline; raise `kind` if there is none."""
+        """Return the time left before `timeout` and the deadline; raise `kind` if none is left."""
         if self.deadline is None:
             return timeout
         remaining_s = self.deadline - time.monotonic()
@@ -85,9 +85,9 @@ class DeadlineBackend(httpcore.NetworkBackend):
 def connection_pool(
     url: str, backend: DeadlineBackend, certificates: Callable[[], ssl.SSLContext], **options: Any
 ) -> httpcore.ConnectionPool:
-    """Return the connections to a server, through the environment's proxy unless it is on this machine.
+    """Return a connection pool for a server, through the environment's proxy unless it is on this machine.
 
-    Raises UsageError for a proxy of another kind.
+    Raises UsageError for an unsupported kind of proxy.
     """
     server = urlsplit(url)
     options["network_backend"] = backend
@@ -102,14 +102,14 @@ def connection_pool(
     address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
     if parts.scheme not in PROXIES:
         raise UsageError(
-            f"a proxy in the environment variables begins with {parts.scheme!r}: expected an address such as "
+            f"a proxy in the environment has the scheme {parts.scheme!r}: expected an address such as "
             "'http://proxy:3128'"
         )
     return PROXIES[parts.scheme](address, user, **options)
 
 
 class _DeadlineStream(httpcore.NetworkStream):
-    """Sends a request's head with its body: httpcore writes them one by one, and the server would read twice."""
+    """Sends a request's head together with its body, which httpcore writes separately: the server reads only once."""
 
     def __init__(self, stream: httpcore.NetworkStream, backend: DeadlineBackend) -> None:
         self._stream = stream
@@ -118,7 +118,7 @@ class _DeadlineStream(httpcore.NetworkStream):
 
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
         if self._held:
-            with contextlib.suppress(httpcore.WriteError):  # as httpcore does: a server may have said why it closed
+            with contextlib.suppress(httpcore.WriteError):  # as in httpcore: the server may have sent why it closed
                 self._send(timeout)
         return self._stream.read(max_bytes, self._backend.remaining(timeout, httpcore.ReadTimeout))
 

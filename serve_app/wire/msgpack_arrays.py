@@ -1,9 +1,9 @@
-"""Encode numpy arrays in msgpack as openpi's clients and servers do. Nothing here can run code.
+"""Numpy arrays in msgpack, in the format of openpi's clients and servers. Decoding never runs code.
 
 An array is `{b"__ndarray__": True, b"data": bytes, b"dtype": dtype.str, b"shape": shape}`, a numpy scalar
-`{b"__npgeneric__": True, b"data": item, b"dtype": dtype.str}`; the marker keys are bytes, so that no name of an
-observation is taken for one. Source: github.com/Physical-Intelligence/openpi, packages/openpi-client. Arrays are also
-read, not written, as PyPI's msgpack-numpy writes them (github.com/lebedov/msgpack-numpy).
+`{b"__npgeneric__": True, b"data": item, b"dtype": dtype.str}`; the marker keys are bytes, so that they never collide
+with an observation's name. Source: github.com/Physical-Intelligence/openpi, packages/openpi-client. Arrays in the
+format of PyPI's msgpack-numpy are also read, not written (github.com/lebedov/msgpack-numpy).
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ def pack(document: Mapping[str, Any]) -> bytes:
 
 
 def unpack(content: bytes, *, most: int | None = None) -> Any:
-    """Return the document in `content`, with arrays in it as numpy's (not writable: they are the message's memory).
+    """Return the document in `content` with numpy arrays (not writable: they share the message's memory).
 
-    Raises RequestError when it is not msgpack, ObservationError when an array in it does not add up, TooLargeError for
-    more than `most` lists, maps and entries of them.
+    Raises RequestError when it is not msgpack, ObservationError when an array in it is inconsistent, TooLargeError for
+    more than `most` lists, maps and entries.
     """
     hooks = {"object_hook": _unpack_array} if most is None else _counting_hooks(most)
     try:
@@ -69,14 +69,14 @@ def _unpack_array(document: dict[Any, Any]) -> Any:
 
 
 def _counting_hooks(most: int) -> dict[str, Callable[[Any], Any]]:
-    """Return what is called for every map and list, and raises TooLargeError after `most` of what they hold."""
+    """Return hooks for every map and list, which raise TooLargeError after `most` entries."""
     left = most
 
     def count(value: Any) -> Any:
         nonlocal left
         left -= 1 + len(value)
         if left < 0:
-            raise TooLargeError(f"the message holds more than {most} values: more than its policy can need")
+            raise TooLargeError(f"the message holds more than {most} values, the most that its policy needs")
         return value
 
     return {"list_hook": count, "object_hook": lambda document: _unpack_array(count(document))}
@@ -92,7 +92,7 @@ def _are_sizes(shape: list[Any]) -> bool:
 def _array_of_msgpack_numpy(document: Mapping[Any, Any]) -> NDArray[Any]:
     kind = document.get(b"kind", b"")
     if kind not in (b"", ""):  # records, and pickled objects
-        raise ObservationError(f"an array in the message, by msgpack-numpy, is of kind {kind!r:.16}: send numbers")
+        raise ObservationError(f"a msgpack-numpy array in the message has kind {kind!r:.16}: send numbers")
     shape = document.get(b"shape") if document[b"nd"] is True else []  # a scalar has none
     return _array({b"data": document.get(b"data"), b"dtype": document[b"type"], b"shape": shape})
 
@@ -105,7 +105,7 @@ def _array(document: Mapping[Any, Any]) -> NDArray[Any]:
         DTYPES.get(name.decode("latin-1") if isinstance(name, bytes) else name) if type(name) in (str, bytes) else None
     )
     if dtype is None:
-        raise ObservationError(f"an array in the message is of dtype {name!r:.32}: send numbers, such as '<f4'")
+        raise ObservationError(f"an array in the message has dtype {name!r:.32}: send numbers, such as '<f4'")
     if type(shape) is not list or len(shape) > MAX_AXES or not _are_sizes(shape):
         raise ObservationError(f"an array in the message has the shape {shape!r:.64}: expected a list of sizes")
     if type(data) is not bytes or len(data) != math.prod(shape) * dtype.itemsize:
@@ -114,7 +114,7 @@ def _array(document: Mapping[Any, Any]) -> NDArray[Any]:
             f"an array in the message of shape {shape} and dtype {name} needs "
             f"{math.prod(shape) * dtype.itemsize} bytes, got {got}"
         )
-    if dtype.kind == "b" and data.translate(None, b"\0\1"):  # numpy's own view of another byte is undefined
+    if dtype.kind == "b" and data.translate(None, b"\0\1"):  # in numpy any other byte is undefined
         raise ObservationError(f"an array in the message of dtype {name} holds a byte that is neither 0 nor 1")
     array: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape)
     return array

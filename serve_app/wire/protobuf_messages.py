@@ -1,7 +1,7 @@
 """Protobuf message classes built at run time from a short description: no generated code.
 
-Generated code is tied to the protobuf it was made with, and claims its names in the process-wide descriptor pool, where
-others register theirs (KServe's and Triton's packages, robo-gym's). These live in a pool of their own.
+Generated code is tied to its protobuf version, and registers its names in the process-wide descriptor pool, as others
+do (KServe's and Triton's packages, robo-gym's). These classes have their own pool.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def build_messages(
 ) -> dict[str, Any]:
     """Return the classes of a proto3 package by name.
 
-    `messages` gives each one's fields in the order of their numbers, or with a number of their own: `int64 ns`,
-    `repeated float action`, `map float limits` (from string), `bool ready = 17`. A type is one of protobuf's own or a
-    message. A nested message is written Outer.Inner, after its outer one. `oneof` fields share the one oneof of their
-    message, which gets the name `oneof`. `services` gives each service's methods, for reflection alone:
-    `InferRequest InferResponse`, `stream InferRequest stream InferResponse`.
+    `messages` lists each one's fields in the order of their numbers, or with explicit numbers: `int64 ns`,
+    `repeated float action`, `map float limits` (from string), `bool ready = 17`. A type is a protobuf scalar or a
+    message. A nested message is written Outer.Inner, after its outer one. `oneof` fields share their message's only
+    oneof, which is named `oneof`. `services` lists each service's methods, for reflection: `InferRequest
+    InferResponse`, `stream InferRequest stream InferResponse`.
     """
     file = descriptor_pb2.FileDescriptorProto(name=f"rlservo/{package}.proto", package=package, syntax="proto3")
     made: dict[str, Any] = {}
@@ -54,7 +54,7 @@ def build_messages(
             )
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
-    # Classes made at run time have no static type: Any is all a type checker can be told.
+    # Classes made at run time have no static type, hence Any.
     return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}")) for name in messages}
 
 
@@ -62,7 +62,7 @@ def _add_field(message: Any, package: str, path: str, number: int, declaration: 
     kind, name = declaration.rsplit(" ", 1)
     modifier, _, kind = kind.rpartition(" ")
     field = message.field.add(name=name, number=number, label=_Field.LABEL_OPTIONAL)
-    if modifier == "map":  # on the wire a repeated message of key and value
+    if modifier == "map":  # on the wire: a repeated message of key and value
         entry = message.nested_type.add(name="".join(part.capitalize() for part in name.split("_")) + "Entry")
         entry.options.map_entry = True
         _add_field(entry, package, path, 1, "string key")

@@ -1,16 +1,16 @@
-"""Names and bounds in requests that client and server share."""
+"""Names and bounds in requests, shared by client and server."""
 
 from __future__ import annotations
 
 LABEL_HEADER = "x-session-id"
-"""Whose request it is, when a canary runs; Ray Serve's own routing also knows the header."""
+"""Header that names the client, for a canary; Ray Serve's own routing also reads it."""
 
 LONGEST_STATUS = 64
-"""Characters of a `final_status`."""
+"""Most characters of a `final_status`."""
 
 MARK = "@"
-"""First character of the names in a carried recurrent state that are not arrays of the policy's graph.
-A client sends them back as they came."""
+"""First character of the names in a carried recurrent state that are not arrays of the policy's graph. A client returns
+them unchanged."""
 
 BELONGS_TO = "@policy"
 """`<name>/<version>#<the graph's hash>`: `Policy.identity`."""

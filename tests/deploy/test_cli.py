@@ -187,7 +187,7 @@ def test_verify_finds_c_that_ends_otherwise(policies: Path, compiled: Path, tmp_
     about["files"]["libur5.so"] = hashlib.sha256((copy / "libur5.so").read_bytes()).hexdigest()
     (copy / "compile.json").write_text(json.dumps(about))
     done = rlservo_here("verify", policies, "--compiled", copy, *REACH)
-    refused(done, 1, "episode 0 (seed 0) ends differently: with the bundle 'success' after ", "with its C '")
+    refused(done, 1, "episode 0 (seed 0) ends differently: with the bundle 'success' after ", "with its C code '")
 
 
 def test_rollout_replay_and_the_cockpit_drive_the_compiled_policy(compiled: Path, tmp_path: Path) -> None:
@@ -206,7 +206,7 @@ def test_rollout_replay_and_the_cockpit_drive_the_compiled_policy(compiled: Path
 @pytest.mark.parametrize(
     ("words", "fragment"),
     [
-        ((), "give --checkpoint to compare the bundle with, or --env with --disturb or --compiled"),
+        ((), "expected --checkpoint to compare the bundle with, or --env with --disturb or --compiled"),
         (("--disturb", "--source", "sb3"), "--source and --vecnormalize need --checkpoint"),
         (("--disturb",), "--disturb needs --env"),
         (("latency=2", "--env", "CartPole-v1"), "need --disturb"),
@@ -270,7 +270,7 @@ def test_truncated_or_missing_file_is_refused(bundle: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("words", "fragment"),
     [
-        (("rollout", "CartPole-v1"), "give either --url (a server) or --bundle"),
+        (("rollout", "CartPole-v1"), "expected either --url (a server) or --bundle"),
         (("rollout", "NoSuchEnv-v0", "--bundle", "{bundle}"), "NoSuchEnv"),
         (("rollout", "CartPole-v1", "--bundle", "{bundle}"), "CartPole-v1"),
         (("rollout", "CartPole-v1", "--bundle", "{bundle}", "--env-arg", "x"), "expected NAME=VALUE"),
@@ -304,7 +304,7 @@ def test_every_command_has_help_with_an_example() -> None:
 
 def test_serve_refuses_a_default_policy_that_is_not_served(policies: Path) -> None:
     done = rlservo("serve", policies, "--default-policy", "mir100")
-    refused(done, 2, "the default policy 'mir100' is not among those to serve: ur5")
+    refused(done, 2, "the default policy 'mir100' is not served: expected ur5")
     assert "starting" not in done.stderr
 
 

@@ -37,7 +37,7 @@ def test_arguments_and_bundles_are_checked_before_anything_starts(
         serve_policies([policies], port=port, workers=0)
     with pytest.raises(UsageError, match="threads"):
         serve_policies([policies], port=port, settings={"threads": -1})
-    with pytest.raises(UsageError, match="the default policy 'no' is not among those to serve"):
+    with pytest.raises(UsageError, match="the default policy 'no' is not served"):
         serve_policies([policies], port=port, settings={"default_policy": "no"})
     with pytest.raises(UsageError, match="without API keys"):
         serve_policies([policies], port=port, host="0.0.0.0")

@@ -166,13 +166,13 @@ def test_discrete_policies_take_and_give_integers(call: Call, policies: Path) ->
     [
         (lambda m: m.raw_input_contents.append(b"\0" * 12), "540 bytes, but its raw_input_contents are 12"),
         (lambda m: m.raw_input_contents.extend([b"", b""]), "1 inputs and 2 raw_input_contents"),
-        (lambda m: m.inputs[0].contents.fp32_contents.extend([1.0] * 9), "has 9 numbers, not the 135"),
-        (lambda m: m.inputs[0].contents.int_contents.extend([1] * 135), "belongs into 'fp32_contents'"),
-        (lambda m: setattr(m.inputs[0], "datatype", "BYTES"), "a policy reads numbers"),
+        (lambda m: m.inputs[0].contents.fp32_contents.extend([1.0] * 9), "has 9 values, expected 135"),
+        (lambda m: m.inputs[0].contents.int_contents.extend([1] * 135), "belongs in 'fp32_contents'"),
+        (lambda m: setattr(m.inputs[0], "datatype", "BYTES"), "holds strings: send numbers"),
         (lambda m: setattr(m.inputs[0], "datatype", "FP12"), "must be one of"),
         (lambda m: m.inputs[0].shape.__setitem__(0, -1), "must be a list of sizes"),
         (lambda m: m.inputs.pop(), "at least one tensor"),
-        (lambda m: m.inputs.append(m.inputs[0]), "there twice"),
+        (lambda m: m.inputs.append(m.inputs[0]), "given twice"),
     ],
 )
 def test_a_malformed_request_is_one_sentence(call: Call, change: Callable[[Any], Any], sentence: str) -> None:

@@ -100,7 +100,7 @@ function forget() {
 function askForKey(why) {
   wantsKey = true;
   clear();
-  setText(byId("state"), "This server wants an API key.");
+  setText(byId("state"), "This server requires an API key.");
   setText(byId("key-error"), why);
   byId("key-form").hidden = false;
   byId("key").focus();

@@ -79,8 +79,8 @@ def test_bad_input_is_one_sentence_and_exit_code_2(shipped: Path, tmp_path: Path
         code, sentence = refused("--bundle", bundle, "--port", str(port))
         assert code == 2 and f"127.0.0.1:{port}: the port is taken" in sentence
     for arguments, expected in (
-        ((), "give one of --url"),
-        (("--bundle", bundle, "--url", "http://127.0.0.1:1"), "give one of --url"),
+        ((), "expected one of --url"),
+        (("--bundle", bundle, "--url", "http://127.0.0.1:1"), "expected one of --url"),
         (("--bundle", bundle, "--env", "rlservo/Nothing-v0"), "'rlservo/Nothing-v0' is not registered"),
         (("--bundle", bundle, "--env", "rlservo/NoObstacleNavigationMir100Sim-v0"), "does not fit"),
         (("--bundle", bundle, "--env-arg", "ur_model=ur7"), "'ur7' does not exist"),

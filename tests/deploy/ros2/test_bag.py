@@ -49,4 +49,4 @@ def test_log_info_tells_a_bag_from_a_recording_and_puts_them_on_one_time(ros: Ro
 
     refused = rlservo_here("log", "plot", bag)
     assert refused.returncode == 1
-    assert "holds no decisions of rlservo's policies: its topics are /chatter" in refused.stderr
+    assert "holds no rlservo decisions: its topics are /chatter" in refused.stderr

@@ -138,8 +138,8 @@ def test_node_holds_for_a_slow_and_for_a_lost_server_and_goes_on(ros: Ros, bundl
 @pytest.mark.parametrize("name", ["second", "rlservo"])
 def test_second_node_on_the_same_topic_is_refused(ros: Ros, node: Process, bundle: Path, name: str) -> None:
     second = ros.rlservo("ros2", "--bundle", bundle, "--name", name, "--ros-args", "-r", f"~/action:={COMMANDS}")
-    line = second.wait_for("is commanded by")
-    assert "/rlservo already: end it first" in line
+    line = second.wait_for("is already commanded by")
+    assert "/rlservo: end it first" in line
     assert second.end(0) == 2
     assert node.process.poll() is None
     assert ros.heartbeat()["state"] != "fault"

@@ -62,7 +62,7 @@ def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> 
             over = terminated or truncated
         assert info["final_status"] == "success"
         assert states <= {"blend_in", "run", "hold"}
-    assert [why for _, why in arm.controller.stop_reasons] == ["it came to its end"]
+    assert [why for _, why in arm.controller.stop_reasons] == ["it reached its end"]
 
 
 def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_taken(arm: RunningArm) -> None:
@@ -202,7 +202,7 @@ def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningA
 
 
 def test_wrong_model_and_unreachable_host_are_one_sentence(arm: RunningArm) -> None:
-    with pytest.raises(RobotError, match=r"is a ur5's: ur_model says ur5e"):
+    with pytest.raises(RobotError, match=r"is a ur5's, but ur_model is ur5e"):
         RtdeArm(arm.host, "ur5e")
     with pytest.raises(RobotError, match=r"no UR controller answers at 127\.0\.0\.250"):
         RtdeArm("127.0.0.250", "ur5")

@@ -24,6 +24,6 @@ def test_each_change_is_one_log_line_and_is_given_away_once(caplog: pytest.LogCa
 def test_nothing_but_a_new_connection_follows_a_fault() -> None:
     machine = StateMachine()
     machine.enter(State.FAULT)
-    with pytest.raises(AssertionError, match="run does not follow fault"):
+    with pytest.raises(AssertionError, match="state run cannot follow fault"):
         machine.enter(State.RUN)
     machine.enter(State.CONNECT)

@@ -50,7 +50,7 @@ def test_base_reaches_its_targets_and_stands_when_its_process_stops_or_dies(
     assert outcomes.count("arrived: success") >= len(outcomes) - len(outcomes) // 20, outcomes
 
     second = start_node(ros, all_shipped, "--name", "second")
-    second.wait_for("/cmd_vel is commanded by")
+    second.wait_for("/cmd_vel is already commanded by")
     assert second.end(0) == 2
 
     ros.give_target(20.0, 0.0, frame="map")

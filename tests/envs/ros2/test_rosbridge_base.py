@@ -177,7 +177,7 @@ while True:
     process = subprocess.Popen([sys.executable, "-c", program])
     try:
         base.wait_until(lambda: bool(base.seen) and base.seen[-1][2] > FAST)
-        with pytest.raises(RobotError, match="/cmd_vel is commanded by another client"):
+        with pytest.raises(RobotError, match="/cmd_vel is already commanded by another client"):
             RosBase(base.robot)
         process.kill()
         assert base.moved_for(time.monotonic()) < TIMEOUT_S + BRAKING_S

@@ -431,9 +431,9 @@ def test_a_nested_policy_explores_every_part_in_its_space(export: Callable[[str]
         (lambda obs: obs.update(other=1), "unknown other"),
         (lambda obs: obs["arm"].update(mode=3), "obs.arm.mode: element 0 is 3, outside the observation space's 0..2"),
         (lambda obs: obs["arm"].update(flags=[0, 2, 0, 0]), "obs.arm.flags: element 1 is 2, outside"),
-        (lambda obs: obs.update(grid=(obs["grid"][0],)), "obs.grid: expected a list of its 2 parts, got 1 of them"),
+        (lambda obs: obs.update(grid=(obs["grid"][0],)), "obs.grid: expected a list of 2 parts, got 1 of them"),
         (lambda obs: obs.update(zeta=[0.0, float("nan")]), "obs.zeta: element 1 is nan"),
-        (lambda obs: obs.update(zeta=np.zeros((3, 2))), "not of one batch"),
+        (lambda obs: obs.update(zeta=np.zeros((3, 2))), "different batch sizes"),
         (lambda obs: obs.update(arm=[1]), "obs.arm: expected a map with the keys flags, mode, got a list"),
     ],
 )

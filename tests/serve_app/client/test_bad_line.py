@@ -376,7 +376,7 @@ def test_a_stream_is_refused_in_the_servers_own_words(line: FaultyLine) -> None:
         _ = StreamClient(line.url, "nobody", api_key=KEY).contract
     with pytest.raises(UsageError, match="is not a server address"):
         StreamClient("127.0.0.1:8000")
-    with StreamClient(line.url, "ur5") as client, pytest.raises(Exception, match="wants an API key") as caught:
+    with StreamClient(line.url, "ur5") as client, pytest.raises(Exception, match="requires an API key") as caught:
         _ = client.contract
     assert caught.value.code == "unauthenticated"
 

@@ -215,7 +215,7 @@ def test_a_server_that_is_still_loading_is_waited_for(policies: Path) -> None:
 
 
 def test_a_wrong_address_path_says_where_things_are(served: Served) -> None:
-    with PolicyClient(f"{served.url}/robots", "ur5") as client, pytest.raises(RequestError, match="nothing is at"):
+    with PolicyClient(f"{served.url}/robots", "ur5") as client, pytest.raises(RequestError, match="nothing at"):
         client.act(np.zeros(27))
 
 

@@ -108,7 +108,7 @@ def test_a_state_stays_with_its_version_whatever_becomes_the_default(
     assert server.act("leaky", state={})[1]["version"] == "2"  # the next episode is the new version's
 
     status, reply = server.act("leaky/versions/2", state=first["state"])
-    assert (status, reply["code"]) == (409, "session-conflict") and "is of version 1" in reply["error"]
+    assert (status, reply["code"]) == (409, "session-conflict") and "belongs to version 1" in reply["error"]
     status, reply = server.act("other", state=first["state"])
     assert (status, reply["code"]) == (410, "session-lost") and "'leaky/1#" in reply["error"]
     server.store = store_of(versions["2"])
@@ -139,7 +139,7 @@ def test_a_state_without_a_version_is_only_used_where_it_can_be_of_one_alone(
     ("state", "sentence"),
     [
         ({"@policy": None}, "missing h"),  # nothing that begins an episode by accident
-        ({"@policy": 1, "h": [0, 0]}, "must be the string that the last reply gave"),
+        ({"@policy": 1, "h": [0, 0]}, "must be the string from the last reply"),
         ({"@secret": 1, "h": [0, 0]}, "unknown entry '@secret'"),
         ({"@last_action": [0.1]}, "missing h"),
     ],
@@ -301,7 +301,7 @@ def test_the_last_action_is_an_input_of_the_open_inference_protocol(limited: Ser
     step = np.abs(np.reshape(reply["outputs"][0]["data"], (2, 6)) - last).max()
     assert status == 200 and step == pytest.approx(LIMIT, rel=1e-3)
     status, reply = limited.infer("ur5", {"obs": -obs, "last_action": last[:1]})
-    assert status == 422 and "not of one batch" in reply["error"]
+    assert status == 422 and "different batch sizes" in reply["error"]
 
 
 def test_an_action_that_came_too_late_is_not_what_the_next_one_is_measured_from(limited: Server) -> None:

@@ -180,8 +180,8 @@ def test_a_recurrent_policy_is_never_begun_anew_by_accident(ask: Ask, name: str)
         ({"state": {"h": [[1e39] * 8], "c": [[0.0] * 8]}}, "not finite"),
         ({"state": {"h": 1, "c": 1, "z": 1}}, "unknown z"),
         ({"state": 7}, "'state' must be an object"),
-        ({"state": {}, "session_id": "a"}, "either you carry the state, or we do"),
-        ({"state": {}, "end": True}, "'end' is for a session"),
+        ({"state": {}, "session_id": "a"}, "has both 'state' and 'session_id'"),
+        ({"state": {}, "end": True}, "'end' needs a session"),
         ({"session_id": ""}, "'session_id' must be a string of 1 to 128 characters"),
         ({"session_id": "a", "reset": 1}, "'reset' must be true or false"),
         ({"state": {}, "last_action": [0.0]}, "of last_action of shape (2,), got (1,)"),
@@ -429,23 +429,23 @@ def test_the_models_metadata_lists_states_and_leaves_and_a_raw_body_is_refused(p
     ]  # fmt: skip
     connection.request("POST", "/v2/models/lstm_box/infer", b"\0" * 12, {"Inference-Header-Content-Length": "0"})
     reply = connection.getresponse()
-    assert reply.status == 400 and b"is for models of one input" in reply.read()
+    assert reply.status == 400 and b"is for models with one input" in reply.read()
     connection.close()
 
 
 @pytest.mark.parametrize(
     ("change", "status", "sentence"),
     [
-        ({"inputs": ["obs.zeta"]}, 422, "has the input 'obs.arm.flags' and did not get it"),
+        ({"inputs": ["obs.zeta"]}, 422, "needs the input 'obs.arm.flags', which is missing"),
         (
             {"outputs": [{"name": "action"}]},
             400,
-            "an output 'action' does not exist: the model's output is 'action.a.0'",
+            "the output 'action' does not exist: expected 'action.a.0'",
         ),
-        ({"outputs": [{"name": "state_out.h"}], "parameters": {"sequence_id": 1}}, 400, "stays with the sequence"),
+        ({"outputs": [{"name": "state_out.h"}], "parameters": {"sequence_id": 1}}, 400, "is kept with the sequence"),
         ({"parameters": {"sequence_id": 1.5}}, 400, "'sequence_id' must be an integer"),
         ({"parameters": {"sequence_start": 1}}, 400, "'sequence_start' must be true or false"),
-        ({"rows": 3}, 422, "not of one batch: obs.arm.flags 2, obs.arm.mode 3"),
+        ({"rows": 3}, 422, "have different batch sizes: obs.arm.flags 2, obs.arm.mode 3"),
     ],
 )
 def test_a_wrong_nested_request_is_told_what_is_wrong(

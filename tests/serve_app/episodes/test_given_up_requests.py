@@ -170,7 +170,7 @@ def test_a_step_that_came_in_part_before_its_session_began_again_is_refused(
         assert client.ask(*body(OBS[0], start=True))[1]["action"] == episode(OBS[0])
         late.sendall(whole[-5:])
         answer = late.recv(65536).decode()
-    assert " 409 " in answer and "of the episode before" in answer
+    assert " 409 " in answer and "belongs to an earlier episode" in answer
     for obs in OBS[1:]:
         assert client.ask(*body(obs))[1]["action"] == episode(obs)
 

@@ -83,7 +83,7 @@ def test_a_batch_takes_the_places_of_its_episodes(server: Server) -> None:
     assert server.act("wide", rows=6, reset=True)[0] == 200
     status, reply = server.act("too-wide", rows=3, reset=True)
     assert (status, reply["code"]) == (503, "unavailable")
-    assert "remembers 6 episodes already, at most 8, and has no room for 3 more" in reply["error"]
+    assert "remembers 6 of at most 8 episodes and has no room for 3 more" in reply["error"]
     assert server.act("too-wide", rows=2, reset=True)[0] == 200
     assert server.act("one", reset=True)[0] == 503
     assert server.act("one", reset=True, end=True)[0] == 200  # it is not kept

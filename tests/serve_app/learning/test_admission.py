@@ -44,9 +44,9 @@ def test_a_whole_explored_episode_of_a_known_version_is_admitted(ur5: Path, tmp_
     assert isinstance(admitted, Admitted)
     assert admitted.age == 1 and admitted.version == known(episode) and admitted.rewards.tolist() == [0.5] * 4
     assert admission.judge(episode, [known(episode), OLD, OLD]) == "of a version that is too old"
-    assert admission.judge(episode, [OLD]) == "of a version that this run has not made"
+    assert admission.judge(episode, [OLD]) == "of a version that this run did not make"
     foreign = KnownVersion(known(episode).version, "0" * 64, known(episode).contract_sha256)
-    assert admission.judge(episode, [foreign]) == "of another graph or contract than the version's"
+    assert admission.judge(episode, [foreign]) == "whose graph or contract is not the version's"
     assert Admission("another", max_age=1).judge(episode, [known(episode)]) is None
 
 
@@ -107,8 +107,8 @@ def drop(decision: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("forge", "reason"),
     [
-        (change_logp, "whose log-probabilities are not those of their distributions"),
-        (change_action, "whose actions are not what the policy drew"),
+        (change_logp, "whose log-probabilities do not match their distributions"),
+        (change_action, "whose actions are not the policy's draws"),
         (leave_the_bounds, "with an action outside the contract's bounds"),
         (spoil_the_observation, "with an observation that is not finite"),
         (drop, "without their beginning or with a gap"),

@@ -226,7 +226,7 @@ def test_an_episode_that_another_key_ends_teaches_nothing(cell: Cell) -> None:
 
     with cell.run_folder() as run:
         cell.learning(run, sleep=claim).run(versions=1)
-        assert run.state.dropped == {"of which a key without the role explore reported something": 1}
+        assert run.state.dropped == {"with reports from a key without the role explore": 1}
         assert run.state.episodes == BATCH // LENGTH
 
 
@@ -319,12 +319,12 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
             with cell.admin() as client:
                 client.alias("policy", "learning", "1")
 
-        with pytest.raises(ConflictError, match="leads to version 1, but this run had moved it to 2"):
+        with pytest.raises(ConflictError, match="points to version 1, but this run had moved it to 2"):
             cell.learning(run, sleep=play_and_move).run(versions=1)
     assert cell.aliases()["learning"] == "1"
     with (
         cell.run_folder("second") as run,
-        pytest.raises(ConflictError, match=r"already leads to version 1: .*policy alias policy learning='"),
+        pytest.raises(ConflictError, match=r"already points to version 1: .*policy alias policy learning='"),
     ):
         cell.learning(run).run(versions=1)
     assert not (cell.folder / "policies/policy/4").exists()
@@ -340,7 +340,7 @@ def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "reward.py").read_text() == "def reward(): ..."
     with pytest.raises(UsageError, match="is a run with policy 'a', not 'b'"):
         RunFolder(tmp_path / "run", {"policy": "b"}, "def reward(): ...")
-    with pytest.raises(UsageError, match="--reward is not what this run began with"):
+    with pytest.raises(UsageError, match="--reward differs from this run's first one"):
         RunFolder(tmp_path / "run", {"policy": "a"}, None)
 
 

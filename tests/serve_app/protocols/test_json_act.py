@@ -133,13 +133,13 @@ def test_exploring_is_repeatable_by_seed(ask: Ask) -> None:
         ({"obs": OBS, "state": {"h": [0]}}, 400, "bad-request", "does not fit policy 'ur5' (its state: none"),
         ({"obs": OBS, "state": [0]}, 400, "bad-request", "'state' must be an object, state names to numbers, got a l"),
         ({"obs": OBS, "session_id": 7}, 400, "bad-request", "'session_id' must be a string of 1 to 128 characters"),
-        ({"obs": OBS, "reset": True}, 400, "bad-request", "'reset' is for a session: also send its 'session_id'"),
+        ({"obs": OBS, "reset": True}, 400, "bad-request", "'reset' needs a session: also send its 'session_id'"),
         ({"obs": OBS, "timestamp": "now"}, 400, "bad-request", "'timestamp' must be a number of seconds"),
         ({"obs": OBS, "explore": 1}, 400, "bad-request", "'explore' must be true or false"),
         ({"obs": OBS, "seed": -1}, 400, "bad-request", "'seed' must be in 0"),
         ({"obs": OBS, "seed": True}, 400, "bad-request", "'seed' must be an integer, got true"),
         ({"obs": OBS, "deadline_ms": "1"}, 400, "bad-request", "'deadline_ms' must be a number"),
-        ({"obs": OBS, "deadline_ms": 0}, 408, "deadline-passed", "nothing computed"),
+        ({"obs": OBS, "deadline_ms": 0}, 408, "deadline-passed", "no action was computed"),
         ([OBS], 400, "bad-request", "must be a JSON object"),
         (b"", 400, "bad-request", "the request body is empty"),
         (b"{", 400, "bad-request", "the request body is not JSON"),
@@ -165,7 +165,7 @@ def test_unknown_names_versions_paths_and_methods(ask: Ask) -> None:
         ("POST", "/v1/policies/ur6/act", 404, "unknown-policy", "this server has gridworld, unsafe, ur5"),
         ("POST", "/v1/policies/ur5/versions/9/act", 404, "unknown-version", "expected one of 1, 2, 10"),
         ("POST", "/v1/policies/..%2f..%2fetc/act", 400, "bad-request", "without percent-encoding"),
-        ("POST", "/v1/policies/ur5/act/", 404, "not-found", "nothing is at"),
+        ("POST", "/v1/policies/ur5/act/", 404, "not-found", "nothing at"),
         ("GET", "/v1/policies/ur6", 404, "unknown-policy", "this server has"),
         ("GET", "/v1/policies/ur5/versions/9", 404, "unknown-version", "expected one of"),
         ("GET", "/nowhere", 404, "not-found", "policies are under /v1/policies"),
@@ -244,7 +244,7 @@ def test_an_unexpected_failure_says_no_more_than_that(
         for method, path in (("POST", "/v1/policies/ur5/act"), ("GET", "/v1/policies")):
             status, _, reply = ask(method, path, {"obs": OBS} if method == "POST" else None)
             assert status == 500
-            assert reply == {"error": "the server failed on this request; its log says how", "code": "internal"}
+            assert reply == {"error": "the server failed on this request; its log has the cause", "code": "internal"}
     finally:
         loading.store = store
     assert "AttributeError" in caplog.text

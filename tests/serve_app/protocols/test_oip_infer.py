@@ -119,7 +119,7 @@ def test_tritons_own_client_works_unchanged(
     assert facts["unknown"] == ["404", "no policy 'nobody' is loaded: this server has gridworld, unsafe, ur5"]
     assert facts["short"][0] == "422" and "of shape [-1, 27] (-1 is the batch), got [33, 26]" in facts["short"][1]
     assert facts["nan"][0] == "422" and "element 0 (element_0) is nan" in facts["nan"][1]
-    assert facts["late"][0] == "408" and "nothing computed" in facts["late"][1]
+    assert facts["late"][0] == "408" and "no action was computed" in facts["late"][1]
 
 
 def test_json_data_may_be_nested_or_flat_and_of_any_number_type(ask: Ask, store: PolicyStore) -> None:
@@ -169,7 +169,7 @@ def test_a_body_of_nothing_but_one_tensor_is_read(ask: Ask, store: PolicyStore) 
         np.float32(reply["outputs"][0]["data"]).reshape(33, 6), store.act("ur5", None, BATCH).action
     )
     status, reply = infer(ask, BATCH.tobytes()[:-1], **{LENGTH: "0"})
-    assert status == 422 and "108 bytes per observation, and the body has 3563" in reply["error"]
+    assert status == 422 and "108 bytes per observation, but the body has 3563" in reply["error"]
 
 
 def test_output_parameters_override_the_requests_own(ask: Ask) -> None:
@@ -256,12 +256,12 @@ def test_the_models_name_may_be_said_again(ask: Ask) -> None:
         ({"inputs": []}, 400, "'inputs' must be a list of tensors"),
         ({"inputs": [7]}, 400, "must be an object, got the number 7"),
         (request(tensor(ROW, [1, 27])) | {"extra": 1}, 400, "unknown field 'extra'"),
-        (request(tensor(ROW, [1, 27])) | {"model_name": "ur10"}, 400, "'model_name' is not 'ur5'"),
+        (request(tensor(ROW, [1, 27])) | {"model_name": "ur10"}, 400, "'model_name' differs from 'ur5'"),
         (request(tensor(ROW, [1, 27]), id=7), 400, "'id' must be a string, got the number 7"),
         (request(tensor(ROW, [27])), 422, "expects input 'obs' of shape [-1, 27] (-1 is the batch), got [27]"),
         (request(tensor([], [0, 27])), 422, "got an empty batch"),
-        (request(tensor(ROW[:26], [1, 27])), 422, "'data' has the shape [26], and 'shape' says [1, 27]"),
-        (request(tensor([[1, 2], [3]], [1, 27])), 422, "not of equal length"),
+        (request(tensor(ROW[:26], [1, 27])), 422, "'data' has the shape [26], but 'shape' says [1, 27]"),
+        (request(tensor([[1, 2], [3]], [1, 27])), 422, "differ in length"),
         (request(tensor([*ROW[:26], "x"], [1, 27])), 422, "cannot be read: it holds the string 'x', not numbers"),
         (request(tensor([*ROW[:26], None], [1, 27])), 422, "it holds null"),
         (
@@ -273,20 +273,20 @@ def test_the_models_name_may_be_said_again(ask: Ask) -> None:
         (request(tensor([*ROW[:26], 1e39], [1, 27])), 422, "element 26 (element_26) is inf"),
         (b'{"inputs": [{"name": "obs", "shape": [1], "datatype": "FP32", "data": [NaN]}]}', 422, "of shape [-1, 27]"),
         (request(tensor(ROW, [1, 27], "FP8")), 400, "datatype must be one of BOOL, UINT8"),
-        (request(tensor(ROW, [1, 27], "BYTES")), 400, "holds strings: a policy reads numbers"),
+        (request(tensor(ROW, [1, 27], "BYTES")), 400, "holds strings: send numbers"),
         (request(tensor(ROW, [-1, 27])), 400, "'shape' must be a list of sizes"),
         (request(tensor(ROW, [1, 2**62])), 400, "'shape' must be a list of sizes"),
-        (request(tensor(ROW, [1, 27], name="image")), 422, "has the input 'obs' and has no input 'image'"),
-        (request(tensor(ROW, [1, 27]), tensor(ROW, [1, 27])), 400, "input 'obs' is there twice"),
+        (request(tensor(ROW, [1, 27], name="image")), 422, "has no input 'image': expected 'obs'"),
+        (request(tensor(ROW, [1, 27]), tensor(ROW, [1, 27])), 400, "input 'obs' is given twice"),
         (request(tensor(ROW, [1, 27], parameters={"shared_memory_region": "r"})), 400, "shared memory"),
         (request(tensor(ROW, [1, 27], parameters={"binary_data_size": 108})), 400, "both 'data' and"),
-        (request(tensor(ROW, [1, 27]), outputs=[{"name": "value"}]), 400, "the model's output is 'action'"),
+        (request(tensor(ROW, [1, 27]), outputs=[{"name": "value"}]), 400, "expected 'action'"),
         (request(tensor(ROW, [1, 27]), outputs=[{"name": "action", "parameters": {"classification": 3}}]), 400, "not"),
         (request(tensor(ROW, [1, 27]), parameters={"binary_data_output": 1}), 400, "must be true or false"),
         (request(tensor(ROW, [1, 27]), parameters={"explor": True}), 400, "unknown parameter 'explor'"),
         (request(tensor(ROW, [1, 27]), parameters={"seed": -1}), 400, "'seed' must be in 0.."),
         (request(tensor(ROW, [1, 27]), parameters={"sequence_id": True}), 400, "'sequence_id' must be an integer, or"),
-        (request(tensor(ROW, [1, 27]), parameters={"deadline_ms": 0}), 408, "nothing computed"),
+        (request(tensor(ROW, [1, 27]), parameters={"deadline_ms": 0}), 408, "no action was computed"),
         (request(tensor([0.0] * 27 * 65, [65, 27])), 413, "a batch of 65 observations is too large: at most 64"),
     ],
 )  # fmt: skip
@@ -298,9 +298,9 @@ def test_a_wrong_request_is_told_what_is_wrong(ask: Ask, body: Any, status: int,
 @pytest.mark.parametrize(
     ("length", "raw", "sentence"),
     [
-        ("9999999", 108, "Inference-Header-Content-Length is 9999999, and the body has"),
-        ("-1", 108, "must be the JSON's length, got '-1'"),
-        (None, 104, "needs 108 bytes after the JSON and 104 are left"),
+        ("9999999", 108, "Inference-Header-Content-Length is 9999999, but the body has"),
+        ("-1", 108, "must be the length of the JSON, got '-1'"),
+        (None, 104, "needs 108 bytes after the JSON, but the body has 104 left"),
         (None, 112, "the body has 4 bytes after the last tensor's data"),
     ],
 )

@@ -349,7 +349,7 @@ def test_with_keys_the_page_asks_for_one_and_keeps_it_nowhere(
             server = Served(port)
             server.act(3, key=ROBOT)
             tab.visit(server.url)
-            tab.wait_for_text("This server wants an API key.")
+            tab.wait_for_text("This server requires an API key.")
             tab.wait_for("document.activeElement.id === 'key'")
             assert "ur5" not in tab.text()
             names = "['type', 'autocomplete', 'name', 'value']"
@@ -357,7 +357,7 @@ def test_with_keys_the_page_asks_for_one_and_keeps_it_nowhere(
             assert tab.evaluate(fields) == ["password", "off", None, None]
             picture(tab, "status_page_key", tmp_path)
             for typed, sentence in (
-                (new_key("nobody")[0], "The server refused the key: this API key is not known to the server."),
+                (new_key("nobody")[0], "The server refused the key: the server does not know this API key."),
                 ("ключ", "A key has no spaces and no special letters."),
             ):
                 tab.type(typed)
@@ -380,7 +380,7 @@ def test_with_keys_the_page_asks_for_one_and_keeps_it_nowhere(
             tab.press("Enter")
             tab.wait_for_text("2 policies served")
             tab.visit(server.url)  # as a reload
-            tab.wait_for_text("This server wants an API key.")
+            tab.wait_for_text("This server requires an API key.")
 
 
 def test_a_small_screen_and_a_keyboard_are_enough(tab: Tab, server: Served, tmp_path: Path) -> None:

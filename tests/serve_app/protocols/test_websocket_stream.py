@@ -175,7 +175,7 @@ def test_arrays_of_msgpack_numpy_are_read_as_data(port: int, store: PolicyStore)
         }
         np.testing.assert_array_equal(client.infer({"obs": named})["actions"][0], expected(store))
     for changes in ({"kind": b"O"}, {"kind": b"V"}, {"type": "|O"}, {"type": 7}, {"shape": [28]}, {"data": "x"}):
-        with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="an array in the message"):
+        with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="array in the message"):
             client.infer({"obs": as_msgpack_numpy(OBS, **changes)})
 
 
@@ -203,7 +203,7 @@ def array(**changes: Any) -> bytes:
 @pytest.mark.parametrize(
     ("content", "code", "sentence"),
     [
-        ("text", "bad-request", "text frame: send msgpack in a binary one"),
+        ("text", "bad-request", "text frame: send msgpack in a binary frame"),
         (b"\xc1", "bad-request", "is not msgpack"),
         (b"", "bad-request", "is not msgpack"),
         (pack({"obs": OBS}) + b"\0", "bad-request", "is not msgpack"),
@@ -216,9 +216,9 @@ def array(**changes: Any) -> bytes:
         (pack({"obs": OBS * np.float32(np.nan)}), "bad-observation", "element 0 (element_0) is nan"),
         (pack({"obs": msgpack.ExtType(5, b"x")}), "bad-observation", "cannot read obs"),
         (pack({"element_0": 1.0}), "bad-observation", "missing 'element_1'"),
-        (array(dtype="|O"), "bad-observation", "is of dtype '|O': send numbers"),
-        (array(dtype="<c8"), "bad-observation", "is of dtype '<c8'"),
-        (array(dtype="f4,f4"), "bad-observation", "is of dtype 'f4,f4'"),
+        (array(dtype="|O"), "bad-observation", "has dtype '|O': send numbers"),
+        (array(dtype="<c8"), "bad-observation", "has dtype '<c8'"),
+        (array(dtype="f4,f4"), "bad-observation", "has dtype 'f4,f4'"),
         (array(dtype="<f8"), "bad-observation", "needs 216 bytes, got 108 bytes"),
         (array(shape=[-1]), "bad-observation", "has the shape [-1]"),
         (array(shape=[2**40, 2**40]), "bad-observation", "expected a list of sizes"),
@@ -226,7 +226,7 @@ def array(**changes: Any) -> bytes:
         (pack({"obs": {b"__npgeneric__": True, b"data": "x", b"dtype": "<f4"}}), "bad-observation", "holds a str"),
         (pack({"obs": np.zeros((65, 27), np.float32)}), "too-large", "a batch of 65 observations"),
         (pack({"obs": np.zeros(30_000, np.float32)}), "too-large", "larger than 100000 bytes"),
-        (pack({"obs": OBS, "deadline_ms": 0}), "deadline-passed", "nothing computed"),
+        (pack({"obs": OBS, "deadline_ms": 0}), "deadline-passed", "no action was computed"),
     ],
 )  # fmt: skip
 def test_an_error_is_a_text_frame_then_close_1011(port: int, content: bytes | str, code: str, sentence: str) -> None:
@@ -256,7 +256,7 @@ def test_without_a_default_policy_the_root_says_where_to_connect(store: PolicySt
     with served(create_app(lambda: store, ServerSettings())) as port:
         with pytest.raises(InvalidStatus) as caught:
             OpenpiClient(port)
-        assert b"no default policy, but gridworld, unsafe, ur5" in (caught.value.response.body or b"")
+        assert b"no default policy among gridworld, unsafe, ur5" in (caught.value.response.body or b"")
 
 
 def test_a_server_that_is_loading_refuses_streams_with_503(served: Serve) -> None:

@@ -99,7 +99,7 @@ def test_another_library_than_the_proven_one_is_not_loaded(leaky: tuple[Path, Co
     copy = shutil.copytree(leaky[1].folder, tmp_path / "c")
     with (copy / "libleaky.so").open("ab") as file:
         file.write(b"x")
-    with pytest.raises(BundleTamperedError, match=r"libleaky.so is not the file that was proven"):
+    with pytest.raises(BundleTamperedError, match=r"libleaky.so is not the proven file"):
         CompiledPolicy(copy)
 
 
@@ -107,7 +107,7 @@ def test_a_folder_without_a_library_says_why(leaky: tuple[Path, Compiled], tmp_p
     copy = shutil.copytree(leaky[1].folder, tmp_path / "c")
     about = json.loads((copy / "compile.json").read_text())
     (copy / "compile.json").write_text(json.dumps({**about, "library": None, "unproven": "no C compiler was found"}))
-    with pytest.raises(BundleError, match=r"has no library: it was written without a compiler \(no C compiler"):
+    with pytest.raises(BundleError, match=r"has no library: it was written without a C compiler \(no C compiler"):
         CompiledPolicy(copy)
     with pytest.raises(BundleError, match=r"holds no compiled policy: expected compile\.json"):
         CompiledPolicy(tmp_path)

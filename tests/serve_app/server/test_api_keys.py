@@ -102,11 +102,11 @@ def test_a_key_file_that_is_missing_empty_or_open_to_all_refuses_the_start(tmp_p
     with pytest.raises(UsageError, match="cannot be read"):
         Keys.from_settings(settings)
     file.write_text("# nothing yet\n")
-    with pytest.raises(UsageError, match="name no key, and would leave the server open"):
+    with pytest.raises(UsageError, match="hold no key and would leave the server open"):
         Keys.from_settings(settings)
     file.write_text(CELL_LINE)
     file.chmod(0o666)
-    with pytest.raises(UsageError, match="can be written by every user"):
+    with pytest.raises(UsageError, match="is writable by every user"):
         Keys.from_settings(settings)
     with pytest.raises(UsageError, match="label"):
         new_key("two words")
@@ -163,7 +163,7 @@ def test_only_a_key_that_says_so_explores_in_every_protocol(port: int, store: Po
         for request in (EXPLORE, EXPLORE_OIP):
             found, _, reply = call(port, *request, authorization=f"Bearer {key}")
             assert found == status, reply
-            assert status == 200 or "may not ask for exploring actions" in reply["error"]
+            assert status == 200 or "may not request exploring actions" in reply["error"]
         assert explores(key) is (status == 200)
     with served(create_app(lambda: store, ServerSettings())) as open_port:  # without keys all may
         assert call(open_port, *EXPLORE)[0] == 200

@@ -154,7 +154,7 @@ def restore(file: Path) -> None:
 
 @pytest.mark.parametrize(
     ("how", "sentence"),
-    [("deleted", "cannot be read"), ("empty", "name no key"), ("world-writable", "written by every user"),
+    [("deleted", "cannot be read"), ("empty", "hold no key"), ("world-writable", "writable by every user"),
      ("malformed", "line 2: expected"), ("a folder", "is a folder"), ("a FIFO", "is a FIFO, not a regular file"),
      ("no text", "cannot be read"), ("endless", "is larger than")],
 )  # fmt: skip
@@ -172,7 +172,7 @@ def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
         and keys.changes == 0
     )
     said = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
-    assert len(said) == 1 and "the API keys stay as they were" in said[0] and sentence in said[0]
+    assert len(said) == 1 and "the API keys were not changed" in said[0] and sentence in said[0]
     assert "secret-in-clear" not in said[0]
     restore(file)
     for _ in range(2):

@@ -79,7 +79,7 @@ def test_a_key_gets_its_burst_over_all_of_http_and_then_429_with_a_time_to_wait(
         status, headers, content = ask(port, *request)
         document = json.loads(content)
         assert (status, document["code"]) == (429, "rate-limited")
-        assert "the key 'cell-7' may ask 0.001 times a second here, 3 times at once: wait" in document["error"]
+        assert "the key 'cell-7' allows 0.001 requests a second in this process, 3 at once: wait" in document["error"]
         assert 900 < int(headers["retry-after"]) <= 1000 and 900 < document["details"]["retry_after_s"] <= 1000
     for _ in range(5 * BURST):  # another key's, and who needs none
         assert ask(port, *ACT, key=FREE)[0] == 200
@@ -198,7 +198,7 @@ def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
 
     *good, refused = asyncio.run(calls())
     assert [context.code for context in good] == [None] * BURST
-    assert refused.code is grpc.StatusCode.RESOURCE_EXHAUSTED and "'cell-7' may ask" in refused.details
+    assert refused.code is grpc.StatusCode.RESOURCE_EXHAUSTED and "'cell-7' allows" in refused.details
     assert refused.trailing["rlservo-code"] == "rate-limited" and 900 < int(refused.trailing["retry-after"]) <= 1000
 
 
@@ -214,7 +214,7 @@ def test_a_grpc_streams_messages_count_and_it_goes_on(app: PolicyApp) -> None:
     context = Context(LIMITED)
     errors = asyncio.run(replies())
     # Opening it is a request, too.
-    assert errors[: BURST - 1] == [""] * (BURST - 1) and all("may ask" in error for error in errors[BURST - 1 :])
+    assert errors[: BURST - 1] == [""] * (BURST - 1) and all("allows" in error for error in errors[BURST - 1 :])
     assert len(errors) == BURST + 2 and context.code is None
 
 
@@ -229,8 +229,8 @@ def test_grpc_refuses_exploring_to_a_key_for_actions_alone(app: PolicyApp) -> No
         return context, [reply.error_message async for reply in service.stream(requests(), Context(FREE))]
 
     refused, streamed = asyncio.run(calls())
-    assert refused.code is grpc.StatusCode.PERMISSION_DENIED and "may not ask for exploring" in refused.details
-    assert "may not ask for exploring" in streamed[0] and streamed[1] == ""
+    assert refused.code is grpc.StatusCode.PERMISSION_DENIED and "may not request exploring" in refused.details
+    assert "may not request exploring" in streamed[0] and streamed[1] == ""
 
 
 def test_a_bucket_fills_with_time_up_to_its_burst_and_is_its_labels() -> None:

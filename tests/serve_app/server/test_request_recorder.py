@@ -382,7 +382,7 @@ def test_a_reward_that_is_no_number_is_not_recorded(start: Callable[..., Server]
 def test_a_folder_that_cannot_be_written_to_is_a_sentence(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()
-    with pytest.raises(UsageError, match="file exists: a recording is a new file, or a folder"):
+    with pytest.raises(UsageError, match="file exists: expected a new file, or a folder"):
         create_app(lambda: None, ServerSettings(record=str(file)))
 
 
