@@ -105,7 +105,7 @@ def parse_arguments() -> argparse.Namespace:
 
 @contextlib.contextmanager
 def report_only_on_stdout() -> Iterator[TextIO]:
-    """Give standard output for the report; whatever else writes there, children too, goes to standard error."""
+    """Reserve standard output for the report; other output, that of children too, goes to standard error."""
     sys.stdout.flush()
     stdout = os.dup(1)
     os.dup2(2, 1)

@@ -144,7 +144,7 @@ def argument_parser() -> argparse.ArgumentParser:
     sweep = parser.add_argument_group("hyper-parameter sweep")
     sweep.add_argument("--sweep", action="append", default=[], metavar="NAME=V1,V2,...", help="try each value")
     sweep.add_argument("--search-space", type=Path, metavar="YAML", help="values and ranges (see search_space.py)")
-    sweep.add_argument("--num-samples", type=int, default=1, help="times the space is drawn from")
+    sweep.add_argument("--num-samples", type=int, default=1, help="number of samples from the space")
     sweep.add_argument("--scheduler", choices=["fifo", "asha", "median"], default="fifo", help="stops bad trials early")
     sweep.add_argument("--max-concurrent-trials", type=int, help="trials at once; default: as many as fit")
     sweep.add_argument("--metric", default=RETURN, help="metric that picks the best checkpoint")
@@ -227,7 +227,7 @@ def gpus_per_learner(args: argparse.Namespace) -> float:
 
 
 def check_machine(run: Run, config: AlgorithmConfig | None = None, concurrent: int | None = None) -> None:
-    """Raise UsageError when this machine has too little for the run, before a Ray is started.
+    """Raise UsageError if this machine has too little for the run, before Ray starts.
 
     The driver may share the last core. That is also what a Ray of our own is started with.
     """

@@ -39,7 +39,7 @@ def watch(config: AlgorithmConfig, folder: Path) -> None:
     file = folder / FILE
 
     class Watch(RLlibCallback):
-        """Each process makes its own, before it makes an environment."""
+        """Callback; each process makes its own, before its environment."""
 
         def __init__(self) -> None:
             super().__init__()

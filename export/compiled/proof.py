@@ -53,7 +53,7 @@ class Proof:
     """The largest of these differences, as a multiple of the contract's tolerance."""
     step_us: Mapping[str, float]
     """Of 20,000 steps through the golden vectors and through numbers of almost 0: median, 99% and longest, and the
-    median of the slowest observation, which no interruption of the program is part of."""
+    median of the slowest observation, so that no interruption of the program counts."""
     stack_bytes: int | None
     """Of the deepest call, libm's own aside; None where the compiler does not tell."""
     state_bytes: int

@@ -56,7 +56,7 @@ class OldStack(NewStack):
     """Checkpoints of the old API stack: an algorithm's or a policy's."""
 
     name = "rllib-old"
-    expects = "the same of RLlib's old API stack"
+    expects = "a checkpoint of RLlib's old API stack"
     reference = (
         "RLlib's own agent connectors, compute_actions_from_input_dict and action connectors (old API stack), "
         "restored from the checkpoint, observation filter frozen, exploration off"

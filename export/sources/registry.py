@@ -55,7 +55,7 @@ def find_source(path: Path, name: str | None = None, notify: Notify | None = Non
     mine = [source for source in known if source.detects(given)]
     if len(mine) > 1:
         names = ", ".join(source.name for source in mine)
-        raise CheckpointError(f"{given} may be of several sources ({names}): name one with --source")
+        raise CheckpointError(f"{given} matches several sources ({names}): choose one with --source")
     if not mine:
         raise CheckpointError(
             f"{given} is not a checkpoint of any known source: {'; '.join(f'{s.name}: {s.expects}' for s in known)}"
