@@ -124,8 +124,8 @@ class Shell:
 
     def _stay(self, kind: str, line: str) -> None:
         if kind in self.staying:
-            kinds = list(self.staying)
-            self._press_ctrl_c(*kinds[kinds.index(kind) :])
+            kinds = list(self.staying)  # what began after a server or robot may use it; nothing uses a cockpit
+            self._press_ctrl_c(*([kind] if kind == "cockpit" else kinds[kinds.index(kind) :]))
         if kind in ("serve", "cockpit"):
             line += f" --port {self.ports['8000' if kind == 'serve' else '8090']}"
         started = self.staying[kind] = self._start(f"exec env {line}", kind)

@@ -23,7 +23,7 @@ def compile(
     ] = "c",
     as_json: Json = False,
 ) -> None:
-    """Convert a bundle to one C99 file without dependencies, compiled and proven equal to onnxruntime.
+    """Convert a bundle to one proven C99 file.
 
     A difference is an error, and nothing is written. Without a C compiler the files are written but marked unproven;
     the self-test next to them proves them on a machine that has one.

@@ -26,7 +26,7 @@ def demo(
     ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of that page on 127.0.0.1.")] = 8090,
 ) -> None:
-    """Export two policies, serve them and drive both robots, with the checkpoints that ship with the project.
+    """Export two shipped policies, serve and drive them.
 
     Example: `rlservo demo` in the checkout (`make demo` installs everything first)
     """

@@ -15,7 +15,7 @@ def inspect(
     bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder for its newest version.")],
     as_json: Json = False,
 ) -> None:
-    """Show a bundle's contract: inputs, outputs, baked-in steps and the proof.
+    """Show a bundle's contract and proof.
 
     Example: `rlservo inspect policies/ur5`
     """

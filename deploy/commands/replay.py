@@ -63,7 +63,7 @@ def estimate(
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the bootstrap.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Estimate a bundle's return from recordings of another bundle.
+    """Estimate a bundle's return from another's recordings.
 
     Recordings without exploration only allow fitted Q evaluation. It is experimental: its interval's coverage was
     measured only in a one-dimensional simulation. Do not base a decision to drive on it.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rlservo.envs.robot_server.settings import Settings
 
 robot_server = typer.Typer(
-    help="Serve a simulated or real robot to robo-gym's environments, in place of the ROS robot server.",
+    help="Serve a robot to robo-gym, without ROS.",
     no_args_is_help=True,
 )
 

@@ -184,7 +184,7 @@ def test_a_malformed_request_is_one_sentence(call: Call, change: Callable[[Any],
 
 def test_bytes_that_are_no_message_are_a_bad_request(call: Call) -> None:
     code, details = refused(call, b"\xff\xff\xff")
-    assert code == "INVALID_ARGUMENT" and "no ModelInferRequest" in details
+    assert code == "INVALID_ARGUMENT" and "not a ModelInferRequest" in details
 
 
 def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:

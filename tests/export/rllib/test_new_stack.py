@@ -361,7 +361,7 @@ def test_a_batch_is_so_many_episodes_side_by_side(wide_zoo: Path, export: Callab
     policy = Policy.load(export("lstm_box").path)
     obs = np.load(wide_zoo / "lstm_box.npz")["obs"][:8].reshape(4, 2, 3)
     together = [policy.act(step) for step in obs]
-    with pytest.raises(RequestError, match=r"remembers 2 episodes and got 1 observation: reset"):
+    with pytest.raises(RequestError, match=r"remembers 2 episodes and got 1 observation: call reset"):
         policy.act(obs[0, 0])
     for row in range(2):
         policy.reset()

@@ -68,7 +68,7 @@ def test_a_proxy_of_the_environment_is_asked_with_its_password(proxy: Server, mo
 def test_a_proxy_that_is_none_is_refused_without_its_password(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("http_proxy", "gopher://robot:secret@proxy:70")
     with pytest.raises(
-        UsageError, match=r"begins with 'gopher': expected an address such as 'http://proxy:3128'"
+        UsageError, match=r"has the scheme 'gopher': expected an address such as 'http://proxy:3128'"
     ) as refusal:
         Transport("http://policies.example", timeout_s=10, retries=0)
     assert "secret" not in str(refusal.value)
