@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -88,8 +89,9 @@ def run(
     lines: list[str] = []
 
     def read_lines() -> None:
-        for line in console:
-            lines.append(line)  # each as it comes
+        with suppress(OSError):  # its terminal is gone
+            for line in console:
+                lines.append(line)  # each as it comes
 
     threading.Thread(target=read_lines, name="console", daemon=True).start()
     on_ready()

@@ -16,6 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -235,8 +236,8 @@ def run(controller: Controller, host: str, link: Link, stop: threading.Event, on
     server = ControllerServer(controller, host=host, link=link)
 
     def read_lines() -> None:
-        for line in sys.stdin:
-            if line.strip():
+        with suppress(OSError):  # its terminal is gone
+            for line in filter(str.strip, sys.stdin):
                 server.do(lambda line=line: print_reply(obey(server, line)))  # type: ignore[misc]
 
     def print_reply(reply: str) -> None:
