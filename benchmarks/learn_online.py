@@ -171,7 +171,7 @@ class Cell:
         while not condition():
             dead = [name for name, process in self.processes.items() if process.poll() is not None]
             if dead or time.monotonic() > deadline:
-                raise SystemExit(f"waited for {what} in vain: {dead or 'time is over'}; see {self.folder}/*.log")
+                raise SystemExit(f"waited for {what}: {dead or 'time is over'}; see {self.folder}/*.log")
             time.sleep(1.0)
 
     def close(self) -> None:

@@ -318,7 +318,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise errors.UsageError(f"{path}: cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise errors.UsageError(f"{path}: no YAML: {error}") from error
+        raise errors.UsageError(f"{path}: not YAML: {error}") from error
     missing = [name for name in NEEDED if not isinstance(settings, dict) or name not in settings]
     if missing:
         raise errors.UsageError(f"{path}: has no {missing[0]}; {SHIPPED}/*/training.yaml are examples")

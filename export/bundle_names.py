@@ -43,7 +43,7 @@ def check_names(name: str | None, version: str | None) -> None:
 def choose_target(out: Path, name: str, version: str | None) -> Path:
     """Return the folder to write, which does not exist yet; the version defaults to the next integer.
 
-    Raises UsageError when that version exists already, or something is in the way.
+    Raises UsageError when that version already exists, or something is in the way.
     """
     policy = out / name
     if (out.exists() and not out.is_dir()) or (policy.exists() and not policy.is_dir()):
@@ -53,6 +53,6 @@ def choose_target(out: Path, name: str, version: str | None) -> Path:
     if version is None:
         version = str(max((version_key(entry)[0] for entry in versions), default=0) + 1)
     if version in present:
-        raise UsageError(f"{policy / version} exists already: versions are never overwritten; leave the version out "
+        raise UsageError(f"{policy / version} already exists: versions are never overwritten; leave the version out "
                          f"for the next one")  # fmt: skip
     return policy / version

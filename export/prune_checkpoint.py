@@ -42,7 +42,7 @@ def prune_checkpoint(
 
 def _prune(files: Files, target: Path, app_dir: str | Path, notify: Callable[[str], None]) -> list[Path]:
     if target.exists():
-        raise UsageError(f"{target} exists already: give a new folder to prune into")
+        raise UsageError(f"{target} already exists: give a new folder to prune into")
     notify(f"loading {files.root}: {PICKLES}")
     with user_code(app_dir):
         facts = read_facts(files.root, notify)

@@ -48,8 +48,8 @@ class Place:
             return cls(topic, kind, tuple(path.split(".")), index, float(factor or 1.0), float(offset or 0.0))
         except ValueError:
             raise UsageError(
-                f"element {element!r} is mapped to {text!r}: expected TOPIC TYPE FIELD, '/imu sensor_msgs/msg/Imu "
-                "angular_velocity.z * 57.3' say"
+                f"element {element!r} is mapped to {text!r}: expected TOPIC TYPE FIELD, such as '/imu "
+                "sensor_msgs/msg/Imu angular_velocity.z * 57.3'"
             ) from None
 
     def read(self, message: Any) -> float | None:
@@ -77,7 +77,7 @@ def places(contract: Contract, mapped: Mapping[str, str]) -> tuple[list[Place], 
     known: list[str] = []
     for side, space in (("observation", contract.observation_space), ("action", contract.action_space)):
         if not isinstance(space, BoxSpec) or len(space.shape) != 1:
-            raise UsageError(f"policy {contract.name!r}: the {side} is no vector: `rlservo ros2` maps vectors")
+            raise UsageError(f"policy {contract.name!r}: the {side} is not a vector: `rlservo ros2` maps only vectors")
         count = space.shape[0]
         names = [one.name for one in space.elements] or [str(index) for index in range(count)]
         known += [f"{side}.{name}" for name in names]

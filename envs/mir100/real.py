@@ -20,7 +20,9 @@ class _RealBase(Mir100Navigation):
 
     def __init__(self, *, robot: str = "", **arguments: Any) -> None:
         if not robot:
-            raise ValueError("robot is missing: expected the base's address, say robot=ros2: or rosbridge://HOST:9090")
+            raise ValueError(
+                "robot is missing: expected the base's address, such as robot=ros2: or rosbridge://HOST:9090"
+            )
         super().__init__(robot=robot, **arguments)
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def test_versions_count_up_and_are_never_overwritten(zoo: Path, tmp_path: Path, 
     first = export_checkpoint(zoo / "cart_pole", tmp_path, name="balance", version="7", notify=notices.append)
     second = export_checkpoint(zoo / "cart_pole", tmp_path, name="balance", notify=notices.append)
     assert (first.path.name, second.path.name) == ("7", "8")
-    with pytest.raises(UsageError, match=r"balance/7 exists already"):
+    with pytest.raises(UsageError, match=r"balance/7 already exists"):
         export_checkpoint(zoo / "cart_pole", tmp_path, name="balance", version="7", notify=notices.append)
 
 

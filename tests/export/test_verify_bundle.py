@@ -161,7 +161,7 @@ def test_a_pruned_checkpoint_names_no_folder_of_the_machine_it_was_trained_on(
         assert file.is_dir() or (trained_here not in file.read_bytes() and str(zoo).encode() not in file.read_bytes())
     facts = json.loads((tmp_path / "small" / "rlservo_facts.json").read_text())
     assert facts["algorithm"] == "PPO" and facts["env_id"] == "Pendulum-v1"
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         prune_checkpoint(zoo / "pendulum", tmp_path / "small", notify=notices.append)
 
 

@@ -92,7 +92,7 @@ def test_all_modules_are_written_or_none(wide_zoo: Path, app: Path, tmp_path: Pa
         export_all_modules(damaged, tmp_path / "out", app_dir=app, notify=notices.append)
     assert not (tmp_path / "out").exists()
     (tmp_path / "out" / "team-wheels" / "7").mkdir(parents=True)
-    with pytest.raises(UsageError, match="exists already"):
+    with pytest.raises(UsageError, match="already exists"):
         export_all_modules(wide_zoo / "plain_team", tmp_path / "out", version="7", app_dir=app, notify=notices.append)
     assert [str(path.relative_to(tmp_path / "out")) for path in sorted((tmp_path / "out").rglob("*"))] == [
         "team-wheels", "team-wheels/7",
