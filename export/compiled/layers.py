@@ -172,7 +172,7 @@ def _pool(program: Program, node: Node) -> None:
 
 
 def _recurrent(program: Program, node: Node) -> None:
-    """LSTM and GRU, forward, a step of a sequence after the other (a policy's has one)."""
+    """LSTM and GRU, forward, one step of a sequence after another (a policy's has one)."""
     names, given = [*node.inputs, *[""] * 8][:8], node.attributes
     w, r, b = _constants(program, node, names[1:4])
     (steps, batch, width), hidden = program.value(names[0]).shape, r.shape[2]

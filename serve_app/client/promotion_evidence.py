@@ -68,7 +68,7 @@ def read_metrics(text: str, policy: str) -> dict[str, Process]:
     except (ValueError, KeyError) as error:
         raise UntrustedError(f"the metrics cannot be read: {error!r}") from None
     if not processes:
-        raise UnavailableError(f"the metrics have no series of policy '{policy}'")
+        raise UnavailableError(f"the metrics have no series for policy '{policy}'")
     for replica, process in processes.items():
         for version in process.versions:
             counts = [count for _, count in buckets(process.numbers, ANSWERS, version)]

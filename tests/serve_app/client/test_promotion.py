@@ -517,7 +517,7 @@ def test_a_server_that_is_restarted_counts_from_zero_and_rolls_back(run: Any, se
 
 GONE: dict[str, Callable[[str], str | None]] = {
     "not now": lambda _: None,
-    "no series of policy 'ur5'": lambda _: "",
+    "no series for policy 'ur5'": lambda _: "",
     "has not loaded version 2": lambda text: re.sub(r"rlservo_policy_loaded\{.*\n", "", text),
     "follows plan 0, not yet": lambda text: re.sub(r"rlservo_plan_generation\{.*\n", "", text),
 }

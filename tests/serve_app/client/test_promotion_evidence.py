@@ -134,7 +134,7 @@ def test_metrics_are_summed_over_protocols_for_each_process() -> None:
     (process,) = read_metrics(TEXT + TEXT.replace('"ur5"', '"other"'), "ur5").values()
     assert (process.plan, process.versions) == (7, {"2"})
     assert process.numbers == {f"{OUTCOMES}/2/ok": 7, f"{ANSWERS}/2/0.01": 7, f"{ANSWERS}/2/+Inf": 8}
-    with pytest.raises(UnavailableError, match="have no series of policy 'ur5'"):
+    with pytest.raises(UnavailableError, match="have no series for policy 'ur5'"):
         read_metrics("python_info 1.0\n", "ur5")
 
 
