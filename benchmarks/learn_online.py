@@ -47,6 +47,7 @@ NAME, ALIAS = "ur5", "learning"
 ROBOTS, SPEED = 8, 8.0
 CONTROL_RATE_HZ = 10.0  # the environment's
 WINDOW, GOAL = 100, 0.95
+LEARNING_RATE = 1.5e-4  # of the adaptation
 SHIPPED = Path(__file__).resolve().parent.parent / "examples/checkpoints/ur5_positioning"
 RLSERVO = [sys.executable, "-m", "rlservo.deploy.cli"]
 
@@ -337,10 +338,13 @@ def plot(cell: Cell, result: dict[str, Any]) -> None:
 
 
 def whole_checkpoint(folder: Path) -> Path:
-    """Return a checkpoint of the shipped policy that can be trained: its weights after one short iteration."""
+    """Return a checkpoint of the shipped policy that can be trained: its weights after an iteration without change.
+
+    The learner goes on with the checkpoint's settings, so the learning rate rises after that iteration.
+    """
     settings = yaml.safe_load((SHIPPED / "training.yaml").read_text())
     settings |= {"begin": {"with": SHIPPED.name}, "stop": {**settings["stop"], "env_steps": 1, "episodes": 1}}
-    settings["training"] |= {"lr": 1e-7, "num_epochs": 1}
+    settings["training"] |= {"lr": [[0, 1e-7], [10_000, 1e-7], [10_001, LEARNING_RATE], [1e9, LEARNING_RATE]]}
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "settings.yaml").write_text(yaml.safe_dump(settings))
     script = SHIPPED.parent.parent / "train_shipped.py"
@@ -397,6 +401,7 @@ def main() -> None:
     parser.add_argument("--no-faults", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("bench/learn_online"))
     args = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the cell's processes end with this one
     checkpoint = args.checkpoint or whole_checkpoint(args.out.with_name(f"{args.out.name}_start"))
     cell = Cell(args.out, checkpoint, args.minutes, args.every, args.disturb, args.canary)
     try:
