@@ -1,6 +1,6 @@
-"""A real robot in the place of a simulated one: what the mirrors of an arm and of a base share.
+"""A real robot in place of a simulated one: the common part of the mirrors of an arm and of a base.
 
-The model stands where the robot was measured, and a control cycle passes in real time. The state machine around the
+The model follows the robot's measured state, and a control cycle passes in real time. The state machine around the
 policy is here: faults and connecting again, a person who takes over, late and stale commands.
 """
 
@@ -33,7 +33,7 @@ class Measured(Protocol):
 
 
 class Robot(Protocol):
-    """A robot that carries out one command after the other; `fault` is empty while it takes them."""
+    """A robot that executes one command after another; `fault` is empty while it accepts them."""
 
     @property
     def phase(self) -> Phase: ...
@@ -60,7 +60,7 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
     def __init__(
         self, connect: Callable[[float], RobotT], operator: Operator, *, cycle_s: float, age_bound_s: float
     ) -> None:
-        """`connect` takes the time [s] after which the robot holds without a command. Raises what it raises."""
+        """`connect` takes the time [s] after which the robot holds without a command; its errors are raised."""
         self.operator, self.states = operator, StateMachine()
         self.stale_actions = 0
         self._connect, self._cycle_s, self._age_bound_s = connect, cycle_s, age_bound_s
@@ -78,12 +78,12 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
 
     @abstractmethod
     def _show(self, state: MeasuredT) -> None:
-        """Put the model where the robot is."""
+        """Set the model to the robot's state."""
 
     # -- instead of the simulation's
 
     def hold(self) -> None:
-        """Decelerate and stand, unless a person leads the robot."""
+        """Decelerate and hold, unless a person leads the robot."""
         if self.states.state != State.HUMAN:
             self._robot.hold()
 
@@ -143,7 +143,7 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
         self._due_s = time.monotonic()
 
     def _may_act(self) -> bool:
-        """Return whether a command may go to the robot; hold where what was observed is too old to act on."""
+        """Return whether a command may go to the robot; hold if the observation is too old to act on."""
         if self.states.state in (State.HUMAN, State.FAULT):
             return False
         age_s = _age_s(self.state_seen)

@@ -1,6 +1,6 @@
-"""A real arm in the place of the simulated one: the environments see it through the scene's model.
+"""A real arm in place of the simulated one: the environments see it through the scene's model.
 
-The model stands where the arm was measured, so that tool, contacts and pictures are computed as in the simulator;
+The model follows the arm's measured positions, so that tool, contacts and pictures are computed as in the simulator;
 commands go to the arm.
 """
 
@@ -26,14 +26,14 @@ from rlservo.envs.ur.simulation import URSimulation
 if TYPE_CHECKING:
     from rlservo.envs.robots.metrics import ArmMetrics
 
-AT_START = 0.03  # [rad], from which on the arm need not move
-PATH_STEP = 0.05  # [rad], between two poses of a way that are looked at
+AT_START = 0.03  # [rad], within which the arm need not move
+PATH_STEP = 0.05  # [rad], between two checked poses of a path
 SETTLE_S = 0.2
 
 
 # `stopped_by` has one type in both bases.
 class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The scene of an arm that is a real one. What `connect` returns is closed by `close`."""
+    """The scene of a real arm. `close` also closes the object that `connect` returns."""
 
     def __init__(
         self,
@@ -46,9 +46,9 @@ class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[r
         metrics: str | None = None,
         **scene: Any,
     ) -> None:
-        """`connect` takes the time [s] after which the arm holds without a setpoint. Raises what it raises.
+        """Connect. `connect` takes the time [s] after which the arm holds without a setpoint; its errors are raised.
 
-        `metrics` is the address, HOST:PORT, at which Prometheus reads the arm's.
+        `metrics` is the address, HOST:PORT, at which Prometheus reads the arm's metrics.
         """
         URSimulation.__init__(self, ur_model, max_velocity_scale=max_velocity_scale, cycle_s=cycle_s, **scene)
         Mirror.__init__(self, connect, operator, cycle_s=cycle_s, age_bound_s=AGE_BOUND_S)
@@ -68,9 +68,9 @@ class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[r
     # -- instead of the simulation's
 
     def place(self, joint_positions: ArrayLike) -> bool:
-        """Move the arm slowly to joint positions [rad] (6,), after asking; return whether it would collide there.
+        """Move the arm slowly to joint positions [rad] (6,), after confirmation; return whether it would collide there.
 
-        Raises InvalidResetError where something is in the way, RobotError for a robot that has stopped.
+        Raises InvalidResetError if something is in the way, RobotError if the robot has stopped.
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         if super().place(goal):
@@ -81,10 +81,10 @@ class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[r
         for share in np.linspace(0.0, 1.0, 2 + int(away / PATH_STEP)):
             if super().place(start + share * (goal - start)) and share > 0.0:
                 links = " and ".join(self.contacts()[0])
-                raise InvalidResetError(f"on the straight way to the start {links} would touch: move the arm by hand")
+                raise InvalidResetError(f"{links} would touch on the straight path to the start: move the arm by hand")
         if away > AT_START:
             speed = self._robot.limits.start_speed * self._robot.limits.speed_scale
-            self.operator.confirm(f"the robot moves to its start, {away:.2f} rad at {speed:.2g} rad/s")
+            self.operator.confirm(f"the robot will move to its start, {away:.2f} rad at {speed:.2g} rad/s")
             self.states.enter(State.GO_TO_START, f"{away:.2f} rad away")
             try:
                 self._robot.go_to(goal)
@@ -101,13 +101,13 @@ class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[r
         return self.in_collision
 
     def settle(self) -> None:
-        """Wait until the arm stands."""
+        """Wait until the arm is at rest."""
         self.hold()
         time.sleep(SETTLE_S)
         self._look()
 
     def command(self, joint_positions: ArrayLike) -> None:
-        """Replace the setpoint, unless a person leads the arm or what was observed is too old to act on."""
+        """Replace the setpoint, unless a person leads the arm or the observation is too old to act on."""
         self.data.act[:] = self._robot.setpoint()
         super().command(joint_positions)
         if self._may_act():

@@ -1,6 +1,6 @@
 """A real base in place of the simulated MiR100: the environments see it through the scene's model.
 
-The model stands where odometry has the base; commands go to the base.
+The model follows the base's odometry; commands go to the base.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Vector = NDArray[np.float64]
 
 # `stopped_by` has one type in both bases.
 class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The scene of a base that is a real one; `close` stops it."""
+    """The scene of a real base; `close` stops it."""
 
     _is_connected = False  # `place` is called by the simulation's constructor
 
@@ -46,7 +46,7 @@ class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):  # pyright: 
     def place(
         self, pose: ArrayLike, *, target: ArrayLike | None = None, cubes: Sequence[ArrayLike] | Vector | None = None
     ) -> bool:
-        """Stand where the base stands, with a new target, after asking. Raises RobotError for a base that stopped."""
+        """Start at the base's position with a new target, after confirmation. Raises RobotError if the base stopped."""
         if not self._is_connected:
             return super().place(pose, target=target, cubes=cubes)
         self._recover()
@@ -54,7 +54,7 @@ class MirroredMir100(Mirror[RosBase, BaseState], Mir100Simulation):  # pyright: 
         self._look()
         super().place(self.pose, target=target)
         x, y, _ = self.target
-        self.operator.confirm(f"the robot drives to {x:.2f}, {y:.2f} m in its odometry's frame")
+        self.operator.confirm(f"the robot will drive to {x:.2f}, {y:.2f} m in its odometry's frame")
         self._begin()
         self._look()
         return False
