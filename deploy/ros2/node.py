@@ -24,7 +24,6 @@ from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.environment import check_fit, check_proven, make_env
 
 HEARTBEAT_S = 0.5
-AGAIN_S = 1.0  # until a robot that could not be connected to is tried again
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # DiagnosticStatus' levels
 # Environments of ours by the simulated one that a policy was trained in, and the frame of their target.
 REAL = {
@@ -212,15 +211,9 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
     options = {**robot.reset_options(start="here"), option: goal}
     try:
         observation, _ = env.reset(options=options)
-    except ValueError as error:  # the robot's refusal, or a target that cannot be
-        why = str(error)
-        if not isinstance(error, RobotError):
-            node.enter("refused", why)
-            return number
-        node.enter("fault", why)
-        time.sleep(AGAIN_S)
-        # What has stopped a robot is a word before the sentence. It must not move by itself once that is mended.
-        return number if why.partition(":")[0].isidentifier() else number - 1
+    except ValueError as error:  # a robot must not move by itself once its fault is mended: a new target is needed
+        node.enter("fault" if isinstance(error, RobotError) else "refused", str(error))
+        return number
     policy.reset()
     is_first = True
     while not stop.is_set() and node.wanted is Wanted.RUN and target.number == number:
