@@ -237,7 +237,7 @@ def test_a_server_that_ends_leaves_it_unfinished_and_it_says_how_to_go_on(versio
     log = tmp_path / "log.jsonl"
     with (
         started(versions, tmp_path / "runtime") as server,
-        promoting(at_version_1(server), log, "2", "--for", "2s") as process,
+        promoting(at_version_1(server), log, "2", "--for", "10m") as process,
     ):
         wait_for_checks(process, log, 1)
         server.run.process.send_signal(signal.SIGTERM)
