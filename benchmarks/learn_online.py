@@ -2,7 +2,7 @@
 
     python examples/train_shipped.py ur5_positioning --set stop.metric=success --set stop.value=0.5   # half trained
     python benchmarks/learn_online.py runs/ur5_positioning/checkpoint --minutes 30
-    python benchmarks/learn_online.py --disturb payload=3,latency=4 --canary --no-faults      # adaptation
+    python benchmarks/learn_online.py --disturb payload=5,latency=10 --canary --no-faults --every 5      # adaptation
 
 Every robot is a process of its own that acts at eight times its control rate, or as fast as the server answers; the
 last one is a ur5e with a real arm's noise. `rlservo serve` records, `rlservo learn` learns. It ends when 95 of the
@@ -139,7 +139,7 @@ class Cell:
         self.wait(self.is_ready, "the server")
 
     def start_learner(self) -> None:
-        more = ["--promote", "60s", "--canary", "50%"] if self.with_canary else []
+        more = ["--promote", "90s", "--canary", "50%", "--max-success-drop", "10%"] if self.with_canary else []
         self.start("learner", [*RLSERVO, "learn", str(self.checkpoint), "--policy", NAME, "--server", self.url,
                                "--repository", self.path("policies"), "--follow", self.url, "--every", str(self.every),
                                "--alias", ALIAS, "--out", self.path("run"), *more])  # fmt: skip
@@ -358,14 +358,18 @@ def verdicts(cell: Cell) -> dict[str, str]:
     found = {}
     for path in sorted((cell.folder / "run" / "promotions").glob("*.jsonl"), key=lambda path: int(path.stem)):
         ends = [entry for entry in map(json.loads, path.read_text().splitlines()) if entry["event"] == "end"]
-        found[path.stem] = f"{ends[-1]['outcome']}: {ends[-1]['why']}" if ends else "not finished"
+        found[path.stem] = ": ".join(ends[-1]["decided"][:2]) if ends else "not finished"
     return found
 
 
 def compare(cell: Cell, seeds: int) -> dict[str, Any]:
-    """Return how the first and the last version do, without exploration, on the same seeds that no robot saw."""
+    """Return how the first and the last version do, without exploration, on the same seeds that no robot saw.
+
+    With canaries the last version is the last one that was promoted.
+    """
     wins: dict[str, list[bool]] = {}
-    versions = [known["version"] for known in cell.state()["versions"]]
+    refused = {version for version, verdict in verdicts(cell).items() if not verdict.startswith("promoted")}
+    versions = [known["version"] for known in cell.state()["versions"] if known["version"] not in refused]
     for version in (versions[0], versions[-1]):
         with rlservo.Policy.load(cell.folder / "policies" / NAME / version) as policy:
             env, wins[version] = make_env("ur5", cell.disturbance), []
