@@ -1,4 +1,4 @@
-"""Python for `make setup`: new enough for constraints.txt, and the one that the virtual environment has.
+"""Check of `make setup`'s Python: new enough for constraints.txt, and the one that the virtual environment has.
 
 Run with the Python that PYTHON names, which may be of any version; the argument is the environment's folder.
 """
@@ -17,7 +17,7 @@ if sys.version_info < (3, 11):
 try:
     program = "import sys; print('{}.{}'.format(*sys.version_info[:2]))"
     theirs = subprocess.check_output([sys.argv[1] + "/bin/python", "-c", program], text=True).strip()
-except (OSError, subprocess.CalledProcessError):  # there is none, or its Python is gone: it is made again
+except (OSError, subprocess.CalledProcessError):  # no environment, or its Python is gone: it is made again
     theirs = ours
 if theirs != ours:
     sys.exit(

@@ -214,8 +214,8 @@ def metric_list() -> str:
     text.append(
         paragraph(
             "`GET /metrics` answers in Prometheus' format. Every series also has the label `replica`, the process "
-            "that counted. A worker answers for all workers of its server; behind a load balancer scrape each replica. "
-            "Drift (`observation_...`) is measured from one request in 16, for policies with `MeanStdFilter`."
+            "that counted it. A worker answers for all workers of its server; behind a load balancer scrape each "
+            "replica. Drift (`observation_...`) is measured from one request in 16, for policies with `MeanStdFilter`."
         )
     )
     found = sorted(one for module in (metrics, sampled_metrics) for one in metric_calls(module))
@@ -227,7 +227,7 @@ def metric_list() -> str:
 
 
 def models(kind: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models inside of a type."""
+    """Yield the models inside a type."""
     if inspect.isclass(kind) and issubclass(kind, BaseModel):
         yield kind
     for part in get_args(kind):

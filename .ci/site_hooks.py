@@ -71,6 +71,6 @@ def on_post_build(config: Any) -> None:
         shutil.copy(files_of_swagger_ui() / name, site / "swagger" / name)
     control: Any = object()  # nothing is asked of it
     text = openapi(create_app(lambda: None, ServerSettings(), control=control).table).decode().replace("</", "<\\/")
-    # Of a document of OpenAPI 3.1 Swagger UI resolves references by the page's address, which is none from disk.
+    # Swagger UI resolves an OpenAPI 3.1 document's references by the page's address, which a page from disk lacks.
     text = text.replace('"openapi":"3.1.0"', '"openapi":"3.0.3"', 1)
     (site / "openapi.html").write_text(OPENAPI_PAGE % text, encoding="utf-8")

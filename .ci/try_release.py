@@ -1,4 +1,4 @@
-"""Trial of a release's files: each is installed into an empty environment and run.
+"""Trial of a release's files: each is installed into an empty environment and tried.
 
 `python .ci/try_release.py dist` exports a shipped checkpoint and asks a server for an action, with wheel and
 sdist. It takes some minutes: each environment gets PyTorch and RLlib.

@@ -38,10 +38,10 @@ def read_elements(
         observation = _elements(description.get("observation", ()))
         action = _elements(description.get("action", ()))
         rate = _rate(description.get("control_rate_hz"))
-    except (Exception, SystemExit) as error:  # importing and asking run the user's own code
+    except (Exception, SystemExit) as error:  # importing and describing run the user's own code
         notify(
-            f"the elements stay without names, which changes nothing else: environment {env_id} cannot be asked for "
-            f"them ({first_line(error)})"
+            f"the elements stay unnamed, which changes nothing else: environment {env_id} cannot name them "
+            f"({first_line(error)})"
         )
         return ElementNames()
     spaces = {"observation": recipe.observation_space, "action": recipe.action_space}

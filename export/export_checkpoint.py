@@ -1,7 +1,7 @@
 """`rlservo export`: restore a checkpoint, build the graph, prove it, and only then name the bundle.
 
-Everything is written into a temporary folder next to the target, which is renamed at the end or removed: a bundle is
-there whole or not at all.
+Everything is written into a temporary folder next to the target, which is renamed at the end or removed: a bundle
+exists whole or not at all.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 GOLDEN_SAMPLES = {"likely": 48, "wide": 8, "extreme": 8}
-GOLDEN_BYTES = 2_000_000  # of images a few observations are as much as a bundle should carry
+GOLDEN_BYTES = 2_000_000  # a bundle should carry only a few observations if they are images
 SEED = 20240
 TORCH = ("torch", "onnx", "onnxscript", "gymnasium")
 
@@ -119,14 +119,14 @@ def export_checkpoint(
     """Export one policy of a checkpoint to `out/<name>/<version>/`.
 
     `checkpoint` is a path that a source knows (docs/how-to/sources.md), or a URI of such a folder; `source` names the
-    source, by default recognised from the path. `name` defaults to the environment's (of several policies with the
-    module's behind it), `version` to the next integer after the newest one present. `app_dir` holds the user's own
-    classes, if the checkpoint needs any. `value` False leaves the value head out, which other servers compute for each
-    action, too: a third of a small policy's time. `untrained_filter` also exports an observation filter whose
-    statistics are empty, or only evaluation's. `vecnormalize` and `frame_stack` are for Stable-Baselines3: its
-    observation statistics, if they are not beside the model, and the number of frames it stacked. `reward` names the
-    contract's reward function, `module:function`. `notify` gets one sentence for each thing a person should know (by
-    default they are logged), `progress` what is being done.
+    source, by default recognised from the path. `name` defaults to the environment's (followed by the module's if there
+    are several), `version` to the next integer after the newest one present. `app_dir` holds the user's own classes, if
+    the checkpoint needs any. `value` False leaves out the value head, which other servers would compute for each
+    action: a third of a small policy's time. `untrained_filter` also exports an observation filter whose statistics are
+    empty, or only evaluation's. `vecnormalize` and `frame_stack` are for Stable-Baselines3: its observation statistics,
+    if they are not beside the model, and the number of frames it stacked. `reward` names the contract's reward
+    function, `module:function`. `notify` gets one sentence for each thing a person should know (by default they are
+    logged), `progress` what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give the trainer's own actions. Nothing is left behind then.
@@ -159,9 +159,8 @@ def export_all_modules(
 ) -> list[ExportResult]:
     """Export every policy of a checkpoint, each to `out/<name>-<module id>/<version>/`: all of them, or none.
 
-    A module that is a script and not a network is left out and reported to `notify`.
-    A module whose agents are treated differently gives a bundle an agent, `<name>-<module id>-<agent id>`. The rest is
-    as for `export_checkpoint`.
+    A module that is a script and not a network is left out and reported to `notify`. A module whose agents are treated
+    differently gives one bundle per agent, `<name>-<module id>-<agent id>`. The rest is as for `export_checkpoint`.
     """
     with fetch(checkpoint, progress) as local:
         chosen = find_source(Path(local), source, notify)
@@ -282,8 +281,8 @@ def _check_filter(files: PolicyFiles, facts: CheckpointFacts, restored: Restored
         options.notify(f"{why}; {trained}")
     elif frozen is not None and steps is not None and frozen.count < steps / 2:
         options.notify(
-            f"the observation filter's statistics come from {frozen.count:,} observations; {trained}: those that "
-            "acted in training had seen more than the checkpoint holds"
+            f"the observation filter's statistics come from {frozen.count:,} observations; {trained}: the env "
+            "runners that acted in training had seen more than the checkpoint holds"
         )
 
 
@@ -369,7 +368,7 @@ def _left_out(recipe: Recipe, read: Collection[str]) -> set[str]:
 def _golden_inputs(recipe: Recipe, references: list[Reference], run: Runner) -> Inputs:
     """Return inputs of every kind; those where two choices tie stay out, as another machine may choose either.
 
-    A policy with a state gives steps of its sequences, each with the state it met there.
+    For a policy with a state they are steps of sequences, each with its state.
     """
     pools: dict[str, list[Inputs]] = {kind: [] for kind in GOLDEN_SAMPLES}
     discrete = any(not isinstance(space, Box) for space in recipe.action_leaves.values())

@@ -48,15 +48,15 @@ def export_policy(
 ) -> ExportResult:
     """Export a torch module to `out/<name>/<version>/`, proven against its own forward pass.
 
-    The module takes an observation `[batch, *shape]` (of a Dict space a dict, floating-point numbers in single
+    The module takes an observation `[batch, *shape]` (for a Dict space a dict; floating-point numbers in single
     precision) and gives for a Box the action `[batch, *shape]`, for a Discrete or MultiDiscrete one score for each
-    choice `[batch, n]`. The robot gets `action * scale + offset`, with `clip` clipped to the space's bounds.
-    A recurrent module takes one tensor `[batch, ...]` for each entry of `state` after the observation, and returns a
-    tuple of the action and the next ones; the entries are what an episode starts with, without the batch axis.
-    Names and units are one for each element in row-major order. The module itself is left as it is.
+    choice `[batch, n]`. The robot gets `action * scale + offset`, with `clip` clipped to the space's bounds. A
+    recurrent module takes one tensor `[batch, ...]` for each entry of `state` after the observation, and returns a
+    tuple of the action and the next ones; the entries are what an episode starts with, without the batch axis. Names
+    and units are given for each element in row-major order. The module itself is not changed.
 
     Raises UsageError for arguments that do not fit together, UnsupportedError for a module that cannot be traced or
-    does not run on the space's observations, ParityError when the graph gives something else than the module.
+    does not run on the space's observations, ParityError when the graph's results differ from the module's.
     """
     facts = CheckpointFacts(algorithm=algorithm)
     elements = ElementNames(

@@ -1,7 +1,7 @@
 """`rlservo prune`: copy out of a checkpoint only what an export needs, without the user's paths.
 
-RLlib's own configuration pickles hold the training script's location and more, so they stay behind; what they say of
-algorithm, environment and progress goes into one JSON file.
+RLlib's own configuration pickles hold the training script's location and more, so they stay behind; their facts about
+algorithm, environment and progress go into one JSON file.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ def prune_checkpoint(
 ) -> list[Path]:
     """Copy the module, both connector pipelines and the facts of checkpoint `src` to the new folder `dst`.
 
-    Of an old-stack checkpoint that is the policy's state, as it is: one pickle that also holds optimizer and settings,
-    and cannot be taken apart without becoming another file. The copy exports to the same policy, with the same hash; a
-    new-stack one cannot be trained further (the optimizer stays behind).
-    Returns the files kept, relative to `dst`. `notify` gets what was kept, and of any file that names the home
-    folder. Raises CheckpointError or UnsupportedError for `src`, UsageError when `dst` exists.
+    Of an old-stack checkpoint the policy's state is copied unchanged: one pickle that also holds optimizer and
+    settings, and cannot be split without becoming another file. The copy exports to the same policy, with the same
+    hash; a new-stack one cannot be trained further (the optimizer stays behind). Returns the files kept, relative to
+    `dst`. `notify` gets a sentence on what was kept, and on any file that names the home folder. Raises CheckpointError
+    or UnsupportedError for `src`, UsageError when `dst` exists.
     """
     with fetch(src, silent) as local:
         return _prune(locate_checkpoint(local, module_id), Path(dst), app_dir, notify)

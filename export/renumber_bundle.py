@@ -11,7 +11,7 @@ from rlservo.export.contract.contract import contract_json
 
 
 def renumber(bundle: Bundle, version: str, out: Path) -> Bundle:
-    """Copy a bundle to `out/<name>/<version>/`; the number stands in its contract, and in the graph's copy of it.
+    """Copy a bundle to `out/<name>/<version>/`; the number also goes into its contract and the graph's copy of it.
 
     Needs onnx. Raises UsageError for an invalid version, and BundleError.
     """

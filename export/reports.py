@@ -18,9 +18,9 @@ from rich.text import Text
 from rlservo.export.contract.contract import BakedStep, Contract, Evaluation, Parity, StateSpec
 from rlservo.export.contract.spaces import DiscreteSpec, LeafSpec, SpaceSpec, leaf_specs
 
-MANY = 64  # elements shown one by one; of more, the first and the last few
+MANY = 64  # elements shown one by one; if there are more, only the first and the last few
 ENDS = 8
-CHANGING = ("logarithm", "sine_and_cosine", "user_connector")  # steps after which elements are others
+CHANGING = ("logarithm", "sine_and_cosine", "user_connector")  # steps that change which elements there are
 
 
 def contract_report(contract: Contract) -> RenderableType:
@@ -165,7 +165,7 @@ def _shape(shape: Sequence[int]) -> str:
 
 
 def _elements(title: str, space: LeafSpec, frozen: BakedStep | None) -> RenderableType:
-    """Return one row an element: index, name, unit, bounds and, behind a filter, its numbers."""
+    """Return one row per element: index, name, unit, bounds and, behind a filter, its numbers."""
     kind = f"one of {space.n} choices" if isinstance(space, DiscreteSpec) else f"{_shape(space.shape)}, {space.dtype}"
     mean, std = _seen(frozen, space.size)
     named = ["name", "unit"] if space.elements else []

@@ -1,4 +1,4 @@
-"""`rlservo verify`: prove a bundle against its checkpoint again, and let both drive the environment on the same seeds.
+"""`rlservo verify`: prove a bundle against its checkpoint again, and drive the environment with both on the same seeds.
 
 The gate here draws other observations than the export did. The closed loop shows what the gate cannot: that rounding
 does not grow into another episode that matters.
@@ -170,7 +170,7 @@ def _shapes(leaves: dict[str, tuple[int, ...]]) -> str:
 
 def _rollout(policy: _LoopPolicy, env_id: str, arguments: Mapping[str, Any], seeds: range) -> RolloutReport:
     report = rollout(policy, env_id, episodes=len(seeds), seed=seeds.start, env_kwargs=arguments)
-    if report.interrupted:  # half a comparison is none
+    if report.interrupted:  # half a comparison says nothing
         raise KeyboardInterrupt
     return report
 

@@ -49,7 +49,7 @@ def learn(
         ),
     ] = None,
     versions: Annotated[
-        int | None, typer.Option(min=1, help="Stop after this many new versions; at Ctrl-C by default.")
+        int | None, typer.Option(min=1, help="Stop after this many new versions; by default at Ctrl-C.")
     ] = None,
     promote: Annotated[
         str | None,

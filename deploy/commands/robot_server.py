@@ -191,7 +191,7 @@ def server_manager(
         float, typer.Option(min=0.0, help="Seconds without a client after which a robot server exits; 0: never.")
     ] = 120.0,
 ) -> None:
-    """Start robot servers for robo-gym's Sim environments. It stands in for the ROS server manager, until Ctrl-C.
+    """Start robot servers for robo-gym's Sim environments. Runs until Ctrl-C, in place of the ROS server manager.
 
     Example: `rlservo server-manager`, then
     `gym.make("EndEffectorPositioningURSim-v0", ip="127.0.0.1", ur_model="ur5")` in robo-gym

@@ -77,7 +77,7 @@ def _reported(trial: Path, notify: Callable[[str], None]) -> Iterator[tuple[Path
     for line in lines:
         try:
             result = json.loads(line)
-            results[int(result["training_iteration"])] = result  # of a trial that was resumed the last one counts
+            results[int(result["training_iteration"])] = result  # the last one counts if the trial was resumed
         except (ValueError, KeyError, TypeError):
             continue  # a line cut off by a crash
     for path in sorted(child for child in trial.iterdir() if _CHECKPOINT.fullmatch(child.name) and child.is_dir()):

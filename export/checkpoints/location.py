@@ -112,7 +112,7 @@ class CheckpointFiles:
 
     @property
     def together(self) -> Path:
-        """The file that names the class which the modules are parts of."""
+        """The file that names the class that holds the modules."""
         return self.root / MODULES / CTOR_FILE
 
     def sha256(self) -> str:
@@ -164,7 +164,7 @@ def locate_checkpoint(path: str | Path, module_id: str | None = None, agent_id: 
 
 
 def is_known(path: Path, stack: type[Files]) -> bool:
-    """Return whether `path` is RLlib's, of this API stack; one that only an older Ray could read counts as the new."""
+    """Return whether `path` is RLlib's, of this API stack; one that only an older Ray could read counts as new."""
     if not path.is_dir():
         return False
     try:
@@ -257,9 +257,8 @@ def _choose_module(root: Path, module_id: str | None) -> str:
 def _check_complete(files: CheckpointFiles) -> None:
     if (files.module / "state.pkl").is_file() and not _is_module(files.module):
         raise UnsupportedError(
-            f"{files.module} holds its weights in state.pkl, as the first Rays with such checkpoints wrote them "
-            "(2.33 and some after it), where today's RLlib looks for module_state.pkl: it cannot restore them; train "
-            "again with a later Ray and export that"
+            f"{files.module} holds its weights in state.pkl, as Ray 2.33 and a few later releases wrote them; today's "
+            "RLlib looks for module_state.pkl and cannot restore them: train again with a later Ray and export that"
         )
     needed = [(files.module, STATE_STEMS["module"], "the weights")]
     pipelines = (

@@ -18,7 +18,7 @@ from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 POLICIES = "policies"
 POLICY_STATE = "policy_state.pkl"
 ALGORITHM_STATE = "algorithm_state.pkl"
-DEFAULT_POLICY = "default_policy"  # RLlib's id of an only policy, and of an only module
+DEFAULT_POLICY = "default_policy"  # RLlib's id if there is only one policy or module
 RLLIB_FILE = "rllib_checkpoint.json"
 
 _MSGPACK_STATES = ("policy_state.msgpck", "policy_state.msgpack")

@@ -81,7 +81,7 @@ def _unreadable(*_args: Any, **_kwargs: Any) -> Any:
 
 
 def with_current_statistics(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a filter's state, in whose running statistics a sum of squares was called std_array up to Ray 2.47.
+    """Return a filter's state with current names: up to Ray 2.47 the sum of squares was called std_array.
 
     Raises UnsupportedError for statistics in another form.
     """
@@ -98,6 +98,6 @@ def _statistics(saved: Mapping[str, Any]) -> Mapping[str, Any]:
             f"an older Ray) among {', '.join(saved)}"
         )
     mean, squares = saved["mean_array"], saved["std_array"]
-    # A delta is what a filter has seen since it was merged with others': nothing, so these are not used.
+    # A delta counts what a filter has seen since the last merge: nothing here, so these are not used.
     deltas = {"num_pushes_delta": 0, "mean_delta_array": mean, "sum_sq_diff_delta_array": squares}
     return {"num_pushes": saved["num_pushes"], "mean_array": mean, "sum_sq_diff_array": squares, **deltas}

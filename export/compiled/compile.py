@@ -1,4 +1,4 @@
-"""Bundle as one C file with header, self-test and build files, proven where there is a compiler: `rlservo compile`."""
+"""Bundle as one C file with header, self-test and build files, proven if there is a compiler: `rlservo compile`."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from rlservo.serve_app.runtime.compiled_policy import COMPILE_FILE, acting_contr
 from rlservo.serve_app.runtime.loading import open_graph
 from rlservo.serve_app.runtime.policy import Policy
 
-NO_COMPILER = "no C compiler was found; the self-test proves it where there is one"
+NO_COMPILER = "no C compiler was found; run the self-test on a machine that has one"
 
 
 @dataclass(frozen=True)
 class Compiled:
-    """What was written."""
+    """Files that were written, and their proof."""
 
     folder: Path
     about: Mapping[str, Any]
     """As `compile.json` has it."""
     proof: Proof | None
-    """None where there was no compiler."""
+    """None without a compiler."""
 
 
 def compile_bundle(
@@ -52,8 +52,8 @@ def compile_bundle(
     """Write the bundle at `path` as C into the folder `out`, all of it or nothing.
 
     `compiler` is the one to prove it with ($CC or the machine's own by default); `weights_in_file` puts the weights
-    into a binary file beside the C. Raises what `Policy.load` does for a bundle, UnsupportedError, naming an operator
-    that has no C, ParityError where the compiled policy differs from onnxruntime, and UsageError.
+    into a binary file beside the C. Raises what `Policy.load` does for a bundle, UnsupportedError for an operator
+    without C code, ParityError if the compiled policy differs from onnxruntime, and UsageError.
     """
     folder, chosen = Path(out), find_compiler(compiler)
     progress("reading the bundle")
@@ -113,7 +113,7 @@ def compile_bundle(
 def _earlier(folder: Path, name: str) -> dict[str, str]:
     """Return the hashes of what an earlier compilation of this policy left in the folder.
 
-    Raises UsageError where the folder has something else under its name.
+    Raises UsageError if something else in the folder has its name.
     """
     file = folder / COMPILE_FILE
     if folder.exists() and not folder.is_dir():
@@ -131,7 +131,7 @@ def _earlier(folder: Path, name: str) -> dict[str, str]:
 
 
 def _take_places(beside: Path, folder: Path, earlier: Mapping[str, str]) -> None:
-    """Move the files into the folder, where only an earlier compilation's own files give way."""
+    """Move the files into the folder; only an earlier compilation's files are replaced."""
     folder.mkdir(exist_ok=True)
     for name in {*earlier, *(file.name for file in beside.iterdir())}:
         there = folder / name

@@ -18,7 +18,7 @@ from rlservo.export.contract.spaces import BoxSpec, LeafSpec, leaf_specs
 
 MAX_ELEMENTS = 1 << 24  # what a result code has room for
 KINDS = ("OK", "OUT_OF_BOUNDS", "NOT_FINITE", "NOT_A_CHOICE", "ACTION_NOT_FINITE", "ACTION_OUT_OF_SPACE")
-"""Of result codes, counted from 0. The first two come with an action."""
+"""Kinds of result codes, counted from 0. The first two come with an action."""
 BOUNDS_SHOWN = 8  # elements of an unnamed array whose bounds differ, listed in the header
 
 
@@ -27,7 +27,7 @@ class Member:
     """One array of a struct: a leaf of an observation or action, the reward, or a state."""
 
     tensor: str
-    """The graph's name of it."""
+    """Its name in the graph."""
     name: str
     dtype: np.dtype[Any]
     size: int
@@ -125,7 +125,7 @@ def _codes(p: str, u: str) -> list[str]:
         f"    {u}_OK = 0,",
         f"    {u}_OUT_OF_BOUNDS = 1, /* an action, for an observation outside the space that it was trained in */",
         f"    {u}_NOT_FINITE = 2, /* refused: an observation or reward is not a number, or infinite */",
-        f"    {u}_NOT_A_CHOICE = 3, /* refused: an observation that counts or chooses is none of its choices */",
+        f"    {u}_NOT_A_CHOICE = 3, /* refused: a discrete observation is not one of its choices */",
         f"    {u}_ACTION_NOT_FINITE = 4, /* refused: the network computed no number */",
         f"    {u}_ACTION_OUT_OF_SPACE = 5 /* refused: the network computed an action outside the action space */",
         "};",
@@ -139,10 +139,10 @@ def _codes(p: str, u: str) -> list[str]:
         "/* Compute the action for an observation. A refused one changes neither action nor memory. */",
         f"int32_t {p}_act(const {p}_obs *obs, {p}_state *state, {p}_action *action);",
         "",
-        "/* The name of the element of a code, or of the array that it is in where it has none of its own. */",
+        "/* The name of a code's element, or of its array if the element has no name. */",
         f"const char *{p}_element(int32_t code);",
         "",
-        "/* For callers that know no header: the hash of the bundle, and sizeof the state. */",
+        "/* For callers without this header: the hash of the bundle, and sizeof the state. */",
         f"extern const char {p}_bundle[];",
         f"extern const size_t {p}_state_size;",
     ]
@@ -154,7 +154,7 @@ def _elements(u: str, what: str, members: tuple[Member, ...], identifiers: Ident
     for member in members:
         stem = f"{u}_{what.upper()}" + ("" if member.name == "values" else f"_{member.name.split('_', 1)[-1].upper()}")
         if member.leaf is None:
-            yield "/* reward: what the last action brought, 0 at an episode's start */"
+            yield "/* reward: the last action's reward, 0 at an episode's start */"
             continue
         shape = " x ".join(map(str, member.leaf.shape)) or "1"
         yield f"#define {identifiers.make(stem, 'size', upper=True)} {member.size}"
@@ -200,7 +200,7 @@ def bounds_of(member: Member, slack: NDArray[np.float64]) -> tuple[NDArray[Any],
     low, high = member.leaf.bounds()
     low, high = (low - slack).ravel(), (high + slack).ravel()
     low, high = (np.clip(each, float(least), float(most)) for each in (low, high))
-    if kind.kind != "f":  # in Python's integers: the largest of 64 bits are no doubles
+    if kind.kind != "f":  # in Python's integers: the largest 64-bit ones are not doubles
         whole = [map(math.ceil, low.tolist()), map(math.floor, high.tolist())]
         ends = [[min(max(value, int(least)), int(most)) for value in each] for each in whole]
         return np.array(ends[0], kind), np.array(ends[1], kind)

@@ -36,7 +36,7 @@ def dense(program: Program, source: Ref | str, weights: NDArray[Any], bias: NDAr
 
 
 def _constants(program: Program, node: Node, names: Sequence[str]) -> list[NDArray[Any]]:
-    """Return weights, 0 where an optional one is absent; refuse computed ones and other than single precision."""
+    """Return weights, 0 for absent optional ones; refuse computed weights and any but single precision."""
     if not all(program.is_constant(name) for name in names) or program.value(node.inputs[0]).dtype != np.float32:
         raise refused(node.op, "its weights are computed, or not in single precision")
     return [program.value(name) if name else np.zeros(1, np.float32) for name in names]
@@ -81,7 +81,7 @@ def _matmul(program: Program, node: Node) -> None:
 
 
 def _batch_normalization(program: Program, node: Node) -> None:
-    """As trained: one factor and one summand a channel."""
+    """One factor and one summand per channel, as trained."""
     scale, shift, mean, variance = (each.astype(np.float64) for each in _constants(program, node, node.inputs[1:]))
     factor = scale / np.sqrt(variance + node.attributes["epsilon"])
     shape = program.value(node.inputs[0]).shape
@@ -96,10 +96,10 @@ def _batch_normalization(program: Program, node: Node) -> None:
 
 
 class _Windows:
-    """A layer that slides a window over the planes of an input, which is copied into a margin where it needs one."""
+    """A layer that slides a window over the planes of an input, which is padded first if necessary."""
 
     def __init__(self, program: Program, node: Node, kernel: Sequence[int], outside: str) -> None:
-        """`outside` is the number around the planes. Raises UnsupportedError for a rounding that torch never writes."""
+        """`outside` is the padding's value. Raises UnsupportedError for a rounding mode that torch never writes."""
         _, self.channels, *size = program.value(node.inputs[0]).shape
         ranks, given = len(kernel), node.attributes
         steps, apart = (list(given.get(name) or [1] * ranks) for name in ("strides", "dilations"))
@@ -123,7 +123,7 @@ class _Windows:
 
 
 def _convolution(program: Program, node: Node) -> None:
-    """Each place of the output is a dense layer of the patch that it sees."""
+    """Each place of the output is a dense layer over the patch that it sees."""
     weights, bias = _constants(program, node, [*node.inputs[1:], ""][:2])
     _, inner, *kernel = weights.shape
     groups = int(node.attributes["group"])

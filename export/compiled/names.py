@@ -21,9 +21,9 @@ class Identifiers:
         self._given = set(reserved)
 
     def make(self, prefix: str, name: str, *, upper: bool = False) -> str:
-        """Return `prefix` and the letters and digits of `name`, with a number at the end where that was given before.
+        """Return `prefix` and the letters and digits of `name`, with a number at the end if that is taken.
 
-        The prefix keeps it off C's words and other headers' macros.
+        The prefix avoids C's keywords and other headers' macros.
         """
         plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")[:64] or "unnamed"
         wanted = f"{prefix}_{plain}"
@@ -36,13 +36,13 @@ class Identifiers:
 
 
 def prefix_of(name: str) -> str:
-    """Return what all of a policy's identifiers begin with: its name, as far as C takes it."""
+    """Return the prefix of all of a policy's identifiers: its name, in characters that C allows."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     return plain if plain[:1].isalpha() else f"policy_{plain}"
 
 
 def comment(text: str) -> str:
-    """Return text for within a comment: plain ASCII on one line, that cannot end the comment or join lines."""
+    """Return text for use in a comment: plain ASCII on one line, that cannot end the comment or join lines."""
     plain = text.encode("unicode_escape").decode("ascii")
     return plain.replace("*/", "* /").replace("/*", "/ *").replace("\\", "|").replace("??/", "?? /")
 

@@ -18,7 +18,7 @@ from rlservo.export.compiled.names import number
 from rlservo.export.compiled.program import Program, Ref, broadcast, c_type, row_major
 from rlservo.export.compiled.static_graph import Node, refused
 
-# {0}, {1}, ...: operands; {f}: the suffix of libm's functions; {T}: the type of the result. Of floats.
+# For floats. {0}, {1}, ...: operands; {f}: the suffix of libm's functions; {T}: the type of the result.
 ELEMENTWISE: dict[str, str] = {
     "Abs": "fabs{f}({0})", "Neg": "-{0}", "Sqrt": "sqrt{f}({0})", "Reciprocal": "({T})1 / {0}", "Exp": "exp{f}({0})",
     "Log": "log{f}({0})", "Floor": "floor{f}({0})", "Ceil": "ceil{f}({0})", "Round": "rint{f}({0})",
@@ -43,7 +43,7 @@ ELEMENTWISE: dict[str, str] = {
     "Fmod": "fmod{f}({0}, {1})", "IsInf": "{0} > {largest} || {0} < -{largest}",
     "Positive": "{0} > {largest}", "Negative": "{0} < -{largest}",
 }  # fmt: skip
-# Of integers, where they differ. Sums wrap around as onnxruntime's do; dividing by zero gives zero.
+# For integers, if different. Sums wrap around as onnxruntime's do; dividing by zero gives zero.
 INTEGER: dict[str, str] = {
     "Add": "(uint64_t){0} + (uint64_t){1}", "Sub": "(uint64_t){0} - (uint64_t){1}",
     "Mul": "(uint64_t){0} * (uint64_t){1}", "Neg": "0 - (uint64_t){0}", "Pow": "pow((double){0}, (double){1})",
@@ -102,7 +102,7 @@ def _elementwise(program: Program, node: Node) -> None:
     names = [name for name in node.inputs if name]
     dtype = program.value(names[-1 if node.op == "Where" else 0]).dtype
     op, given, settings = node.op, node.attributes, {}
-    if op == "Clip" and len(names) < 3:  # one bound alone
+    if op == "Clip" and len(names) < 3:  # only one bound
         op = "Max" if node.inputs[1] else "Min"
     elif op == "Mod" and given["fmod"]:
         op = "Fmod"
@@ -136,7 +136,7 @@ def _each(program: Program, node: Node, expression: str) -> None:
 
 
 def _cast(program: Program, node: Node) -> None:
-    """Numbers that an integer type lacks become what x86 makes of them, as in onnxruntime."""
+    """Numbers outside an integer type's range are converted as by x86, like in onnxruntime."""
     source, target = program.value(node.inputs[0]).dtype, program.value(node.outputs[0]).dtype
     expression = "{0} != 0" if target == np.bool_ else "{0}"
     if source.kind == "f" and target.kind in "iu":
@@ -163,7 +163,7 @@ def _one_hot(program: Program, node: Node) -> None:
 
 
 def _move(program: Program, node: Node, positions: Sequence[int]) -> None:
-    """Copy numbers from place to place, or just say where they lie when they lie so already.
+    """Copy numbers from place to place, or only alias them if they are already in order.
 
     The node is run once on the numbers of places instead of values, counted through from 1: what comes out says where
     each number comes from, 0 from nowhere.
@@ -195,7 +195,7 @@ def _move(program: Program, node: Node, positions: Sequence[int]) -> None:
 
 
 def _copy(program: Program, read: Ref | str, places: NDArray[np.int64], mine: NDArray[np.bool_], result: Ref) -> None:
-    """Copy one source's numbers to where they belong: in loops where they are a regular block, else by a table."""
+    """Copy one source's numbers to their places: in loops if they are a regular block, else by a table."""
     where = np.argwhere(mine)
     corner, shape = where.min(axis=0), where.max(axis=0) - where.min(axis=0) + 1
     block = places[tuple(slice(c, c + s) for c, s in zip(corner, shape, strict=True))]
@@ -214,7 +214,7 @@ def _copy(program: Program, read: Ref | str, places: NDArray[np.int64], mine: ND
 
 
 def _lookup(program: Program, node: Node) -> None:
-    """Gather by indices that are computed; an index outside is taken as the nearest."""
+    """Gather by computed indices; an index out of range becomes the nearest valid one."""
     shape = program.value(node.inputs[0]).shape
     outer, size, inner = _around(shape, [int(node.attributes["axis"]) % len(shape)])
     count = program.value(node.inputs[1]).size

@@ -35,7 +35,7 @@ class _Place:
 
 @dataclass(frozen=True)
 class Ref:
-    """Where a value's numbers lie, one after the other in row-major order."""
+    """Place of a value's numbers, in row-major order."""
 
     dtype: np.dtype[Any]
     base: str
@@ -50,12 +50,12 @@ class Ref:
         return f"{self.base} + {self.offset}" if self.offset else self.base
 
     def at(self, offset: int) -> Ref:
-        """Return the place so many elements further on."""
+        """Return the place `offset` elements further on."""
         return replace(self, offset=self.offset + offset)
 
 
 def c_type(dtype: np.dtype[Any]) -> str:
-    """Return C's type. Raises UnsupportedError where it has none (half precision, text)."""
+    """Return C's type. Raises UnsupportedError if there is none (half precision, text)."""
     if dtype.name not in C_TYPES:
         raise UnsupportedError(f"values of type {dtype.name} in the policy's graph cannot be compiled to C")
     return C_TYPES[dtype.name]
@@ -79,14 +79,14 @@ class Program:
         self._last_read |= dict.fromkeys(outputs, len(graph.nodes))
 
     def value(self, name: str) -> NDArray[Any]:
-        """Return a value's example: of a constant, what it is."""
+        """Return a value's example; of a constant, the constant itself."""
         return self.graph.values[name]
 
     def is_constant(self, name: str) -> bool:
         return name in self.graph.constants
 
     def begin(self, what: str) -> None:
-        """Begin the statements of the next node, which are called so in a comment."""
+        """Begin the statements of the next node, with `what` as a comment."""
         self._node += 1
         self.emit(f"/* {comment(what)} */")
 
@@ -97,7 +97,7 @@ class Program:
         return self._refs[name]
 
     def operand(self, name: str) -> str | Ref:
-        """Return a constant of one element as a literal, and where anything else lies."""
+        """Return a constant of one element as a literal, and the place of anything else."""
         array = self.value(name)
         return number(array.ravel()[0]) if self.is_constant(name) and array.size == 1 else self.ref(name)
 
@@ -114,9 +114,9 @@ class Program:
             ref.place.names.add(name)
 
     def temporary(self, dtype: Any, size: int) -> Ref:
-        """Return a place for this node alone: the first that no value needed now or later lies in.
+        """Return a place for this node alone: the first that holds no value needed now or later.
 
-        It has room for SPARE elements more, which a kernel may write in passing.
+        It has room for SPARE more elements, which a kernel may overwrite.
         """
         kind, start, size = c_type(np.dtype(dtype)), 0, size + SPARE
         for other in sorted(self._places, key=lambda place: place.start):
@@ -128,7 +128,7 @@ class Program:
         return Ref(np.dtype(dtype), f"state->scratch.{kind.removesuffix('_t')}s", start, place)
 
     def constant(self, array: NDArray[Any], stem: str = "constant") -> str:
-        """Return the name of an array constant; equal ones are one."""
+        """Return the name of an array constant; equal ones share it."""
         key = (array.dtype.name, array.tobytes())
         if key not in self._constants:
             c_type(array.dtype)
@@ -158,9 +158,9 @@ class Program:
         self.emit("{\n" + "\n".join(f"    {line}" for line in lines) + "\n}")
 
     def constants_text(self, prefix: str, least_in_file: int | None) -> tuple[str, NDArray[np.float32] | None]:
-        """Return (definitions of the array constants, those that are left to a file of weights instead).
+        """Return (definitions of the array constants, those that go into a file of weights instead).
 
-        Into that go single-precision ones of `least_in_file` elements or more; None is no such file.
+        The file takes single-precision ones of at least `least_in_file` elements; with None there is no file.
         """
         lines: list[str] = []
         outside: list[NDArray[np.float32]] = []
@@ -195,7 +195,7 @@ def index(strides: Sequence[int]) -> str:
 
 def _collapse(shape: Sequence[int], strides: Sequence[Sequence[int]]) -> tuple[list[int], list[list[int]]]:
     """Return fewer, longer axes for the same elements in the same order."""
-    axes: list[list[int]] = []  # of each its size, then its strides
+    axes: list[list[int]] = []  # each with its size, then its strides
     for size, *steps in zip(shape, *strides, strict=True):
         if axes and all(outer == step * size for outer, step in zip(axes[-1][1:], steps, strict=True)):
             axes[-1] = [axes[-1][0] * size, *steps]

@@ -23,7 +23,7 @@ from rlservo.serve_app.runtime.action_check import ActionCheck
 from rlservo.serve_app.runtime.compiled_policy import CompiledLibrary, acting_contract, is_refused
 
 STEPS = 100  # of ROWS observations
-MOVED = 4  # times that observations are moved by their last bit, where a difference is too large otherwise
+MOVED = 4  # times that observations are moved by their last bit, if a difference is too large otherwise
 TIMES = ("median", "p99", "longest", "slowest_observation")
 COMPILERS = ("cc", "gcc", "clang")
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
@@ -35,37 +35,39 @@ Compute = Callable[[Mapping[str, NDArray[Any]]], Arrays]
 
 @dataclass(frozen=True)
 class Proof:
-    """What was compared, on which machine, and how fast and deep it ran there."""
+    """Figures of a proof: what was compared, with which compiler, and the time and stack that it took."""
 
     compiler: str
     flags: tuple[str, ...]
     golden_vectors: int
     observations: int
     refused: int
-    """Of the observations: those whose action must not leave, for onnxruntime and for the compiled policy alike."""
+    """Observations whose action must not leave, in onnxruntime and in the compiled policy alike."""
     max_abs: float
     max_rel: float
-    """Of the allowed difference."""
+    """Largest difference, as a share of the allowed one."""
     rounding_used: int
-    """Observations that differ by more than the contract's tolerance, and no more than rounding explains: the largest
-    of MOVED draws of what onnxruntime's own numbers move by when the observation's last bit does."""
+    """Observations that differ by more than the contract's tolerance, but no more than rounding explains: the largest
+    change of onnxruntime's own numbers in MOVED draws of the observation's last bit.
+    """
     rounding_most: float
     """The largest of these differences, as a multiple of the contract's tolerance."""
     step_us: Mapping[str, float]
-    """Of 20,000 steps through the golden vectors and through numbers of almost 0: median, 99% and longest, and the
-    median of the slowest observation, so that no interruption of the program counts."""
+    """Time of 20,000 steps through the golden vectors and through numbers near 0: median, 99% and longest, and the
+    median of the slowest observation, so that interruptions do not count.
+    """
     stack_bytes: int | None
-    """Of the deepest call, libm's own aside; None where the compiler does not tell."""
+    """Stack of the deepest call, without libm's; None if the compiler does not report it."""
     state_bytes: int
-    """Of the caller's struct: what is remembered, and memory to compute in."""
+    """Size of the caller's struct: the state, and scratch memory."""
     code_bytes: int
-    """The shared library, weights and all."""
+    """Size of the shared library, weights included."""
 
 
 def find_compiler(given: str | None) -> str | None:
     """Return the C compiler's path: the one given, that of $CC, or the machine's own; None without one.
 
-    Raises UsageError where the given one, or $CC, does not exist.
+    Raises UsageError if the given one, or $CC, does not exist.
     """
     wanted = given or os.environ.get("CC")
     if wanted:
@@ -104,7 +106,7 @@ def _compile(command: Sequence[str], folder: Path) -> None:
 def prove(
     contract: Contract, compiler: str, folder: Path, prefix: str, library: str, compute: Compute, golden: Arrays
 ) -> Proof:
-    """Compile what is in `folder` and compare it with the graph. Raises ParityError, saying what differs."""
+    """Compile what is in `folder` and compare it with the graph. Raises ParityError that names what differs."""
     flags = build(compiler, folder, prefix, library)
     test = _run([f"./{prefix}_test"], folder)
     if test.returncode != 0:
@@ -176,7 +178,7 @@ def _compare_all(contract: Contract, library: CompiledLibrary, compute: Compute,
 def _shares(
     contract: Contract, got: Arrays, expected: Arrays, refused: NDArray[np.bool_], moved: Sequence[Arrays]
 ) -> Arrays:
-    """Return each output's differences as shares of the allowed ones, `[rows, elements]`; 0 where a row is refused."""
+    """Return each output's differences as shares of the allowed ones, `[rows, elements]`; 0 for refused rows."""
     found = {}
     for name, allowed in allowed_differences(contract, expected, moved).items():
         a, b, limit = (
@@ -192,7 +194,7 @@ def _check(
     contract: Contract, first: int, shares: Arrays, got: Arrays, expected: Arrays, moved: Sequence[Arrays],
     here: NDArray[np.bool_], there: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Raise ParityError, saying what differs, where a difference is more than rounding."""
+    """Raise ParityError, naming what differs, if a difference is more than rounding."""
     if (here != there).any():
         row = int(np.flatnonzero(here != there)[0])
         raise ParityError(

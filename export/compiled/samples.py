@@ -17,7 +17,7 @@ ROWS = 100  # episodes side by side
 def sample_inputs(
     contract: Contract, golden: Mapping[str, NDArray[Any]], steps: int
 ) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield `steps` times ROWS observations (and rewards) by tensor name; of one contract always the same."""
+    """Yield `steps` times ROWS observations (and rewards) by tensor name; always the same for one contract."""
     rng = np.random.default_rng(0)
     leaves: dict[str, LeafSpec] = leaf_specs(contract.observation_space, "obs")
     if any(tensor.name == REWARD for tensor in contract.inputs):

@@ -19,7 +19,7 @@ def self_test_text(
     allowed: Mapping[str, NDArray[np.float64]],
     refused: NDArray[np.bool_],
 ) -> str:
-    """Return a program that exits with 0 where every recorded output is reproduced.
+    """Return a program that exits with 0 if every recorded output is reproduced.
 
     `allowed` is the difference that each element of each output may have, and `refused` says which vectors have an
     action that must not leave: `[vectors]`.
@@ -143,7 +143,6 @@ def _rounded_up(allowed: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _table(what: str, struct: str, name: str, array: NDArray[Any]) -> str:
-    """Return the definition of an array `[vectors][elements]`."""
     rows = array.reshape(len(array), -1)
     text = ",\n".join(f"    {{\n{array_text(row, '        ')}\n    }}" for row in rows)
     stem = "_".join(part for part in (what, struct, name) if part)

@@ -19,7 +19,7 @@ from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.runtime.input_numbers import rounding_slack
 
-SMALLEST_IN_BIN = 256  # elements of a constant that goes into the file of weights, where there is one
+SMALLEST_IN_BIN = 256  # elements of a constant that goes into the file of weights, if there is one
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Source:
 
 
 def write_source(face: Interface, contract: Contract, graph: StaticGraph, *, weights_in_file: bool) -> Source:
-    """Raises UnsupportedError, naming an operator."""
+    """Return the C file. Raises UnsupportedError, naming an operator."""
     outputs = [(member, "action", member.tensor) for member in face.action]
     outputs += [(member, "state", f"state_out.{member.tensor}") for member in face.state]
     program = Program(graph, face.inputs, [tensor for _, _, tensor in outputs])
@@ -113,7 +113,7 @@ def _kernels(wanted: set[str]) -> str:
 
 
 def _check_observation(program: Program, face: Interface, member: Member) -> None:
-    """As the runtime: numbers have to be finite and choices to exist; the bounds of a Box are reported."""
+    """Check as the runtime does: numbers must be finite, choices must exist; a Box's bounds are only reported."""
     u, x, loop = face.upper, f"obs->{member.name}[i]", f"i < {member.size}; i++)"
     if member.dtype.kind == "f":
         program.emit(f"for (int i = 0; {loop}\n    if ({_infinite(member, x)}) {_code(face, 'NOT_FINITE', member)}")
@@ -128,7 +128,7 @@ def _check_observation(program: Program, face: Interface, member: Member) -> Non
 
 
 def _check_action(program: Program, face: Interface, member: Member, x: str) -> None:
-    """As the runtime: what is outside the space by more than rounding is refused, rounding is clipped."""
+    """Check as the runtime does: values outside the space are clipped if by rounding only, else refused."""
     assert member.leaf is not None
     loop, (low, high) = f"for (int i = 0; i < {member.size}; i++)", member.leaf.bounds()
     if member.dtype.kind == "f":  # the largest number stands for unbounded, as in the runtime
@@ -153,7 +153,7 @@ def _infinite(member: Member, x: str) -> str:
 
 
 def _outside(program: Program, x: str, bounds: tuple[NDArray[Any], NDArray[Any]]) -> str:
-    """Return the test for a number outside its bounds, '' where its type has no such numbers."""
+    """Return the test for a number outside its bounds, '' if its type has no such numbers."""
     ends = zip("<>", bounds, range_of(bounds[0].dtype), strict=True)
     return " || ".join(f"{x} {sign} {_bound(program, each)}" for sign, each, own in ends if (each != own).any())
 

@@ -27,7 +27,7 @@ class Node:
 
     op: str
     inputs: tuple[str, ...]
-    """Names of values; '' where an optional one is absent."""
+    """Names of values; '' for an absent optional one."""
     outputs: tuple[str, ...]
     attributes: Mapping[str, Any]
     """Defaults included."""
@@ -54,7 +54,7 @@ def read_static_graph(model_bytes: bytes, outputs: Sequence[str], example: Mappi
     """Return the part of a serialized model that computes `outputs`, for the one observation in `example`.
 
     `example` has every input of the graph by name, each `[1, ...]`. Raises UnsupportedError for another domain's
-    operators and for values that are no tensors, as those of branches and loops that depend on the observation.
+    operators and for values that are not tensors, such as those of branches and loops that depend on the observation.
     """
     model = onnx.load_model_from_string(model_bytes)
     wanted = [output for output in model.graph.output if output.name in outputs]
@@ -82,7 +82,6 @@ def read_static_graph(model_bytes: bytes, outputs: Sequence[str], example: Mappi
 
 
 def _needed(graph: onnx.GraphProto, outputs: Sequence[str]) -> list[onnx.NodeProto]:
-    """Return the nodes that the outputs depend on."""
     needed, kept = set(outputs), []
     for node in reversed(graph.node):
         if not needed.isdisjoint(node.output):

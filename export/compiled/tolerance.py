@@ -23,10 +23,10 @@ def allowed_differences(
 ) -> dict[str, NDArray[np.float64]]:
     """Return how far each number of an action or next state may be from `outputs`, the graph's own.
 
-    A float by the contract's tolerance of its scale: half the range of a bounded action, else the largest number in its
-    row. A choice by nothing, unless another one's score ties with its own, or scores are not numbers: then by the
-    distance between those choices.
-    `moved` is what the graph computes for observations moved by their last bit: also by 8 times what that changes.
+    A float may differ by the contract's tolerance of its scale: half the range of a bounded action, else the largest
+    number in its row. A choice must be equal, unless another one's score ties with its own, or scores are NaN: then it
+    may be any of those. `moved` is what the graph computes for observations moved by their last bit: 8 times that
+    change is also allowed.
     """
     rtol, atol = contract.parity.rtol, contract.parity.atol
     leaves = leaf_specs(contract.action_space, "action")

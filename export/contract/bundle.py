@@ -9,8 +9,8 @@ A bundle is a folder `<name>/<version>/` holding
     SHA256SUMS      a hash of each of the files above (`sha256sum -c SHA256SUMS` checks them too)
 
 This module reads and writes those files. It needs numpy and pydantic, and never unpickles. A bundle may come from
-anybody who can write into a folder: only regular files are read, sizes are bounded before anything is read, and what is
-used of a file is what its hash was checked on.
+anyone who can write into a folder: only regular files are read, sizes are bounded before anything is read, and only
+bytes whose hash was checked are used.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ class Bundle:
                 for block in _verified(self.path / name, self.sums[name], self.limits):
                     copy.write(block)
                 copy.flush()
-            except OSError as error:  # of writing: BundleError is none
+            except OSError as error:  # from writing: a BundleError is not an OSError
                 raise BundleError(
                     f"{self.path / name} cannot be copied to {tempfile.gettempdir()}: {error.strerror}"
                 ) from error
@@ -299,14 +299,14 @@ def write_golden(folder: Path, inputs: Mapping[str, NDArray[Any]], outputs: Mapp
     """Write golden.npz; every array's first axis is the sample."""
     arrays = {f"input/{name}": value for name, value in inputs.items()}
     arrays.update({f"output/{name}": value for name, value in outputs.items()})
-    # `allow_pickle` would be one more array to numpy before 2.1; load_bundle refuses pickled ones.
+    # numpy before 2.1 would save `allow_pickle` as one more array; load_bundle refuses pickled ones.
     np.savez_compressed(folder / GOLDEN_FILE, **arrays)  # type: ignore[arg-type]  # for numpy 2's keyword above
 
 
 def write_contract(folder: Path, contract: Contract) -> None:
     """Write contract.json and, with it, SHA256SUMS over all four files; the other three must exist.
 
-    Both are written next to the old ones and then take their names: whatever fails before leaves the bundle as it was.
+    Both are written next to the old ones and then take their names: a failure before that leaves the bundle as it was.
     """
     with tempfile.TemporaryDirectory(prefix=".contract-", dir=folder) as name:
         beside = Path(name)

@@ -13,7 +13,7 @@ from rlservo.export.contract.errors import BundleError
 from rlservo.export.contract.spaces import FrozenModel, Shape, Size, SpaceSpec
 
 VALUE = "value"  # the graph's output of the value head, if it was exported
-REWARD = "reward"  # the graph's input for what the last action brought, of a policy that was trained to see it
+REWARD = "reward"  # the graph's input for the last action's reward, if the policy was trained to see it
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 REWARD_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*)?$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
@@ -82,8 +82,8 @@ class Provenance(FrozenModel):
     """Origin of the policy."""
 
     algorithm: str
-    source: str = Field("rllib", description="Source that read it: 'rllib', 'sb3', ...")
-    framework: str = Field("", description="The framework that restored it, with its version")
+    source: str = Field("rllib", description="Source that read the checkpoint: 'rllib', 'sb3', ...")
+    framework: str = Field("", description="Framework that restored the checkpoint, with its version")
     api_stack: Literal["new", "old"] | None = Field(None, description="RLlib's API stack")
     module_id: str
     agents: tuple[str, ...] = Field(default=(), description="Agents that it acts for in a multi-agent environment")
@@ -103,7 +103,7 @@ class FormatParity(FrozenModel):
     """The largest differences between one written format and the framework's own pipeline."""
 
     max_abs: float = Field(ge=0.0)
-    max_rel: float = Field(ge=0.0, description="Relative to the scale that the gate measures with")
+    max_rel: float = Field(ge=0.0, description="Relative to the gate's scale")
 
 
 class Parity(FrozenModel):
@@ -126,19 +126,19 @@ class Evaluation(FrozenModel):
     first_seed: int
     return_bundle: float
     return_checkpoint: float | None = None
-    return_interval: tuple[float, float] | None = Field(default=None, description="95%, of the mean, normal")
+    return_interval: tuple[float, float] | None = Field(default=None, description="95% interval of the mean, normal")
     success_rate_bundle: float | None
     success_rate_checkpoint: float | None = None
-    success_interval: tuple[float, float] | None = Field(default=None, description="95%, Wilson")
+    success_interval: tuple[float, float] | None = Field(default=None, description="95% interval, Wilson")
     disturbance: str | None = Field(
-        default=None, description="As `rlservo verify --disturb` takes it; 'none' in its first row"
+        default=None, description="Argument of `rlservo verify --disturb`; 'none' in the first row"
     )
     endings: dict[str, int] = Field(default_factory=dict, description="Number of episodes by ending")
     evaluated_at: str
 
 
 class Contract(FrozenModel):
-    """`contract.json`: everything a client, a server or a person needs to know of a policy."""
+    """`contract.json`: everything a client, a server or a person needs to know about a policy."""
 
     schema_version: Literal[1] = 1
     name: str = Field(pattern=NAME_PATTERN)

@@ -20,13 +20,13 @@ them to exit codes.
     ├── ObservationError          bad-observation          shape, dtype, non-finite or misnamed element
     ├── ActionError               unsafe-action            the policy produced an action that must not leave
     ├── DeadlineError             deadline-passed
-    ├── ConflictError             conflict                 a change of what is served that contradicts what is
+    ├── ConflictError             conflict                 a change that contradicts what is served
     │   └── RefusedError              version-refused      a version or configuration that cannot be served
     ├── SessionError              session-conflict         a session's requests contradict each other
     │   └── SessionLostError      session-lost             the server has no such session (any more)
     ├── UnavailableError          unavailable              not ready, or the server cannot be reached
-    │   ├── OverloadedError       over-capacity            more work than the server takes on: try again
-    │   ├── RateLimitError        rate-limited             the API key asked more often than it may
+    │   ├── OverloadedError       over-capacity            the server is busy: try again
+    │   ├── RateLimitError        rate-limited             the API key made more requests than it may
     │   ├── LateError             late                     the observation waited too long: send a newer one
     ├── InternalError             internal                 the server's own fault: see its log
     └── UsageError                bad-usage                an argument or the machine's state prevents the start
@@ -76,7 +76,7 @@ class UnsupportedError(CheckpointError):
 
 
 class NoNetworkError(UnsupportedError):
-    """A module is a script, and no network."""
+    """A module is a script, not a network."""
 
 
 class ParityError(RlservoError):
@@ -124,7 +124,7 @@ class RequestError(RlservoError):
 class StateNeededError(RequestError):
     """The policy has memory, and the request carries none of it.
 
-    A client may not know that before: a limit on the step of its actions is set on the server. For clients it is a
+    A client may not know that in advance: the limit on an action's step is set on the server. Clients get a
     `bad-request` with these details.
     """
 
@@ -194,7 +194,7 @@ class OverloadedError(UnavailableError):
 
 
 class RateLimitError(UnavailableError):
-    """The API key has asked more often than its line allows; nothing was computed."""
+    """The API key has made more requests than its line allows; nothing was computed."""
 
     code = "rate-limited"
 
@@ -211,7 +211,7 @@ class LateError(UnavailableError):
 
 
 class ConflictError(RlservoError):
-    """A change of the served versions that contradicts the present ones."""
+    """A change that contradicts the versions served now."""
 
     code = "conflict"
 

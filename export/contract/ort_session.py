@@ -32,7 +32,7 @@ def open_ort_session(file: Path, threads: int = 1, simplified: Path | None = Non
     if simplified is not None:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
         options.optimized_model_filepath = str(simplified)
-    # A second thread spinning for work burns a core that a robot's control loop wants.
+    # A second thread that spins for work takes a core from the robot's control loop.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # From the path: from bytes onnxruntime 1.31 parses with the interpreter's lock held (0.3 s for 200 MB, during
     # which no policy acts), keeps them indefinitely, and takes twice the memory.

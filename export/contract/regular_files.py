@@ -34,7 +34,7 @@ def open_regular(file: Path, max_bytes: int | None = None) -> Iterator[BinaryIO]
     Raises NotReadableError when it is something else, FileTooLargeError beyond `max_bytes`, and OSError.
     """
     _check(file.stat(), max_bytes)  # before opening: opening a device can do something
-    # It may have been exchanged for a FIFO since: without O_NONBLOCK, opening one waits for its writer.
+    # It may have been swapped for a FIFO since: without O_NONBLOCK, opening one waits for its writer.
     descriptor = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with os.fdopen(descriptor, "rb", buffering=0) as stream:
         _check(os.fstat(stream.fileno()), max_bytes)

@@ -125,8 +125,8 @@ def _quiet() -> Iterator[None]:
     chatty = logging.getLogger("torch.onnx")
     level = chatty.level
     with warnings.catch_warnings(), _silent_descriptors():
-        # A constant baked in by tracing (TracerWarning) is what the parity gate is there to find; the rest is about
-        # the exporter's age and insides.
+        # The parity gate finds constants baked in by tracing (TracerWarning); the rest is about the exporter's age and
+        # internals.
         warnings.simplefilter("ignore")
         chatty.setLevel(logging.ERROR)
         try:

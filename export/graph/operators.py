@@ -5,8 +5,8 @@ large angles in `%`, and write double-precision `atan` for a kernel that onnxrun
 `exact_operators` is entered, torch's Python functions, methods and operators of these names compute what torch itself
 computes (ATen/native, torch 2.13) in steps that survive both exporters. TorchScript needs none of it: it runs torch.
 
-A rounding is promised if the operator itself rounds: `hypot`, `atan2` and the logarithms to a few units in the last
-place, functions without a double-precision kernel to single precision. The rest is bit by bit.
+Operators that themselves round agree to rounding: `hypot`, `atan2` and the logarithms to a few units in the last place,
+functions without a double-precision kernel to single precision. The rest agree bit for bit.
 """
 
 from __future__ import annotations

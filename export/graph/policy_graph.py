@@ -24,7 +24,7 @@ from rlservo.export.recipe.trees import Tree, build, map_tree, named_leaves
 
 
 class TracedNetwork(Protocol):
-    """A module from the network's input to one tensor for each name.
+    """A module that maps the network's input to one tensor for each name.
 
     If the recipe's mode is "given", the action's leaves come before the named ones. A recurrent one takes its
     state as a second argument, a list in the order of `Recipe.network_state`, and returns the next state's tensors

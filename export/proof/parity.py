@@ -1,17 +1,17 @@
 """Parity gate: an exported policy gives the framework's own numbers, or it is not written.
 
-Functions from observations to named outputs are compared, of a policy with a state over whole sequences, each side fed
-with its own.
+Functions from observations to named outputs are compared; with a state, over whole sequences, each side fed with its
+own state.
 
-A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. The scale is half the range of a
-bounded action element; elsewhere the largest number in the same row of the output, at least 1, because the rounding
-of a matrix product grows with its terms and not with their sum. `value` has one number a row, which may be a small
-difference of large terms: its scale is the largest value seen over all observations. A discrete action must be the
-same, unless the framework's own scores for the two choices are that close.
+A difference passes when it is at most `RTOL * max(|reference|, scale) + ATOL`. The scale is half the range of a bounded
+action element; otherwise the largest number in the same row of the output, at least 1, because the rounding of a matrix
+product grows with its terms and not with their sum. `value` has one number a row, which may be a small difference of
+large terms: its scale is the largest value seen over all observations. A discrete action must be the same, unless the
+framework's own scores for the two choices are that close.
 
-Far outside the usual, a network takes the small difference of huge terms, and no two orders of adding them agree. What
-is still rounding there is measured on the framework itself: a difference also passes if it is at most ROUNDING times
-what its own numbers for that sample move by when every floating-point observation moves by its last bit.
+Far outside the usual range a network takes small differences of huge terms, which depend on the order of addition.
+Rounding is therefore also measured on the framework itself: a difference passes if it is at most ROUNDING times the
+change in the framework's own numbers when every floating-point observation moves by its last bit.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any, unread: Sequence
         steps.append(
             BakedStep(
                 step="ignored",
-                detail=f"{', '.join(unread)}: nothing reads it, and an observation may be given without",
+                detail=f"{', '.join(unread)}: nothing reads it; observations may omit it",
                 values={"names": list(unread)},
             )
         )

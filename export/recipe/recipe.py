@@ -33,7 +33,7 @@ class ObservationFilter:
     mean: NDArray[np.float64]
     """Mean, of the observation's shape, in its units."""
     std: NDArray[np.floating[Any]]
-    """Of RLlib's unbiased (n - 1), zero for n <= 1, and single precision because RLlib computes it so."""
+    """Standard deviation; RLlib's is unbiased (n - 1), zero for n <= 1, and in single precision."""
     clip: float | None
     demean: bool = True
     """Whether the mean is subtracted at all (`de_mean_to_zero`)."""
@@ -70,7 +70,7 @@ class Flatten:
 class FrameStack:
     """FrameStacking: the last `frames` observations, `every` steps apart, side by side on the last axis, zeros before.
 
-    RLlib's own has images `[height, width, 1]`, the batched connectors' vectors.
+    RLlib's own stacks images `[height, width, 1]`, the batched connectors' vectors.
     """
 
     frames: int
@@ -140,7 +140,7 @@ class UserStep:
 class Preprocess:
     """The old API stack's preprocessor: one float32 row of the space's leaves, Dict keys in sorted order.
 
-    Discrete leaves are one-hot from their start on. A Box of 128 numbers is taken for an Atari console's memory:
+    Discrete leaves are one-hot from their start on. A Box of shape (128,) is treated as an Atari console's memory:
     `(x - 128) / 128` (ray/rllib/models/preprocessors.py, ray 2.60).
     """
 
@@ -155,7 +155,7 @@ Mode: TypeAlias = Literal["mean", "tanh_mean", "argmax", "given"]
 """Rule from the distribution's parameters (or Q-values) to the deterministic action; or the action is given."""
 
 Transform: TypeAlias = Literal["none", "unsquash", "clip"]
-"""RLlib's step from that action to `env.step`; Box leaves that are not bounded all round are not unsquashed."""
+"""RLlib's step from that action to `env.step`; Box leaves that are not bounded on all sides are not unsquashed."""
 
 DistributionKind: TypeAlias = Literal["diag_gaussian", "squashed_gaussian", "categorical", "multi_categorical", "multi"]
 
@@ -245,7 +245,7 @@ class Recipe:
 
     @property
     def needs_reward(self) -> bool:
-        """Whether the graph has an input `reward`: the reward that the last action brought, 0 at an episode's start."""
+        """Whether the graph has an input `reward`: the last action's reward, 0 at an episode's start."""
         return any(isinstance(step, Previous) and step.rewards > 0 for step in self.steps)
 
 

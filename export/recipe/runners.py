@@ -24,6 +24,6 @@ class Loop(Protocol):
 
 
 def first_step(loop: Loop, inputs: Inputs) -> Outputs:
-    """Return a loop's outputs where every row is an episode's first step."""
+    """Return a loop's outputs for the first step of an episode in every row."""
     rows = len(next(iter(inputs.values())))
     return loop.step(inputs, np.ones(rows, np.bool_))

@@ -1,6 +1,6 @@
 """Sample observations for the proof: likely ones, wide ones, and extremes.
 
-They stay within bounds (`out_of_bounds` decides about others); but a filter that comes first must show its clip.
+They stay within bounds (`out_of_bounds` decides about others), except where a filter comes first, whose clip must show.
 A policy with a state is given sequences in which episodes end and begin at different steps in different rows. The
 numbers come from a recipe's observation space and filter.
 """
@@ -33,8 +33,8 @@ NEW_EPISODE = 0.02  # probability that a row's episode ends at a step, besides t
 class Batch:
     """Observations by input name in the space's dtypes, and their kind.
 
-    In a sequence, `restart` marks the rows that begin an episode; the other rows continue from the batch before. None
-    is a batch of its own.
+    In a sequence, `restart` marks the rows that begin an episode; the other rows continue from the batch before. None:
+    the batch stands alone.
     """
 
     kind: str

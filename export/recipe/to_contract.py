@@ -32,7 +32,7 @@ def space_spec(
     unread: Collection[str] = (),
     name: str = "obs",
 ) -> SpaceSpec:
-    """Return the contract's form of `space`; only a leaf names `elements`, of a nested space by its tensor name.
+    """Return the contract's form of `space`; `elements` are those of its leaves, by tensor name if it is nested.
 
     A Dict's key whose leaves are all `unread` (by input name) is only mentioned; a Tuple keeps its length. An
     action's Discrete loses its `start`: the contract says what goes to `env.step`, and RLlib sends 0 .. n - 1.

@@ -1,8 +1,8 @@
-"""RLlib's env runner for the batched connectors, without what takes as long at each step as they do.
+"""RLlib's env runner for the batched connectors, without the bookkeeping that takes as long per step as they do.
 
 RLlib (2.60) smooths eight timers at each step, counts it for Prometheus, and calls callbacks that do nothing. This one
-logs the mean times and the count of a sample, of the network, the environments and the two pipelines. Episodes are the
-same, bit by bit.
+logs, per sample, the count and the mean times of the network, the environments and the two pipelines. Episodes are the
+same, bit for bit.
 
 Checkpoints name this module and its class: under other names they could not be read.
 """
@@ -40,7 +40,7 @@ REPLACED = (
     ENV_TO_MODULE_SUM_EPISODES_LENGTH_IN,
     ENV_TO_MODULE_SUM_EPISODES_LENGTH_OUT,
 )
-"""Measurements of RLlib while it reset the environments: without measurements here it would never be cleared."""
+"""RLlib's measurements while it resets the environments; without further ones here they would never be cleared."""
 
 
 class BatchedEnvRunner(SingleAgentEnvRunner):

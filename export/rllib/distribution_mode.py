@@ -37,7 +37,7 @@ def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: 
     """Return the rule from the parameters of distribution `name` to its deterministic action.
 
     `deterministic` gives it for parameters `[batch, n]`, such as the network's own `given`; "given" means that no known
-    rule does and the distribution has to be asked. Raises UnsupportedError if it fails or answers at random.
+    rule does, so the graph evaluates the distribution. Raises UnsupportedError if it fails or answers at random.
 
     RLlib 2.60 sends SAC's bare mean on the new API stack where
     the old one and other versions send its tanh: the class in the checkpoint decides.

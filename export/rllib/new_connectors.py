@@ -87,7 +87,7 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: Age
     for piece in env_to_module.connectors:
         step = _observation_step(piece, files, slot)
         name = type(piece).__name__
-        is_batched = type(piece).__module__ == BATCHED_CONNECTORS  # and batches what was changed before it
+        is_batched = type(piece).__module__ == BATCHED_CONNECTORS  # and batches the observation as changed before it
         if step is not None and batched_by and not is_batched:
             raise UnsupportedError(
                 f"the env-to-module connector {name} comes after {batched_by}, which has already passed the "
@@ -178,10 +178,10 @@ def _flatten(piece: Any, space: Any) -> Flatten:
         starts = np.asarray(leaf.start) if isinstance(leaf, Discrete | MultiDiscrete) else np.zeros(1)
         if (starts > 0).any():
             raise UnsupportedError(
-                f"{name}: RLlib's own FlattenObservations cannot one-hot {leaf}, whose values do not start at 0"
+                f"{name}: RLlib's own FlattenObservations cannot encode {leaf}, whose values do not start at 0"
             )
         if isinstance(leaf, MultiDiscrete) and leaf.nvec.ndim != 1:
-            raise UnsupportedError(f"{name}: RLlib's own FlattenObservations cannot one-hot {leaf}, which is a grid")
+            raise UnsupportedError(f"{name}: RLlib's own FlattenObservations cannot encode {leaf}, which is a grid")
     removed = private_names.get(piece, "_keys_to_remove") if isinstance(space, Dict) else None
     without = tuple(removed or ())
     # A Box needs no further detail, which keeps the contract short.

@@ -1,8 +1,8 @@
 """RLlib's own connector pipelines of the new API stack, run for one agent, alone or among several.
 
-If an environment has several agents, the episode is one in which only the exported policy's agent acts: an
-agent's action depends on its own observations alone, because a module that looks at others' is refused. It imports
-ray.rllib, as new_stack.py.
+If an environment has several agents, the episode is one in which only the exported policy's agent acts: an agent's
+action depends on its own observations alone, because a module that looks at others' is refused. It imports ray.rllib,
+as new_stack.py does.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ def pipelines_of(
 def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, module_to_env: Any) -> AgentSlot:
     """Return the agent that a module is exported for; SINGLE_AGENT if the environment has only one.
 
-    A module may serve several: any stands for all where their spaces and the steps before the network are the same.
-    Raises CheckpointError when there is no such agent, AgentsDifferError if they differ and none was named, and
+    A module may serve several: any stands for all if their spaces and the steps before the network are the same. Raises
+    CheckpointError when there is no such agent, AgentsDifferError if they differ and none was named, and
     UnsupportedError for modules that compute together.
     """
     mapping = next((piece for piece in env_to_module.connectors if type(piece).__name__ == MAPPING), None)

@@ -105,7 +105,7 @@ def _preprocessing(preprocessor: Any) -> list[ObservationStep]:
             "pads lists, outside torch"
         )
     for inner in getattr(preprocessor, "preprocessors", ()):
-        _preprocessing(inner)  # refuses what it has to, and switches off the checks
+        _preprocessing(inner)  # refuses unsupported ones, and switches off the checks
     return [Preprocess(space)]
 
 

@@ -25,7 +25,7 @@ from rlservo.export.rllib import private_names
 
 REGISTER = "register_custom_model"
 SKIPPED = {"site-packages", "node_modules", "__pycache__", "build", "dist"}
-MANY_FILES = 2000  # of an --app-dir that is not meant: a home folder, a file system's root
+MANY_FILES = 2000  # more than this: an --app-dir given by mistake, such as a home folder
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def register_custom_parts(model_config: Mapping[str, Any], app_dir: Path) -> Non
 
 
 def _find_class(part: _Part, name: str, app_dir: Path) -> Any:
-    """Return the torch class registered under `name`; of several (one for each framework) the first that is one."""
+    """Return the torch class registered under `name`; the first one if there are several (one for each framework)."""
     reason: CheckpointError | None = None
     for found in (one for file in _sources(app_dir) for one in find_registrations(file, app_dir, name, part.call)):
         try:

@@ -197,7 +197,7 @@ def _restore(files: OldStackFiles, app_dir: Path) -> Any:
     state.pop("_optimizer_variables", None)
     chatty = logging.getLogger("ray._common.deprecation")
     level = chatty.level
-    chatty.setLevel(logging.ERROR)  # that the old stack is old is known
+    chatty.setLevel(logging.ERROR)  # it warns that the old stack is deprecated
     try:
         policy: Any = Policy.from_state(state)
     except Exception as error:  # whatever RLlib, torch or the user's own constructor raises
@@ -313,7 +313,7 @@ def _action_rule(
     )
     children = getattr(kind, "keywords", {}).get("child_distributions", ())
     all_known = all(distribution_kind(getattr(child, "func", child)) for child in children)
-    # The mode is "given" of counted integers, or of the user's own.
+    # The mode is "given" for counted integers and for the user's own distributions.
     distribution = distribution_kind(plain) if all_known and mode != "given" else None
     if distribution is None:
         notify(f"the action distribution {plain.__name__} on {action_space} is not one the export can explore with")

@@ -75,7 +75,6 @@ def set_saved_state(pipeline: Any, folder: Path) -> None:
 
 
 def _arguments(folder: Path) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Return the arguments of a pipeline's constructor."""
     arguments: tuple[tuple[Any, ...], dict[str, Any]] = unpickle(folder / CTOR_FILE)["ctor_args_and_kwargs"]
     return arguments
 

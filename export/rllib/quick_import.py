@@ -1,6 +1,6 @@
 """Faster imports of torch and RLlib, for a process that only restores a checkpoint.
 
-The `__init__` of nearly every package of Ray's imports all modules below it, so that one RLModule brings Tune, Train,
+The `__init__` of nearly every package of Ray's imports all modules below it, so that one RLModule imports Tune, Train,
 Data, pandas and every algorithm (ray 2.60): 1.2 s of processor time for nothing. While this module imports what any
 checkpoint of the new API stack needs, such packages are made without running their `__init__`. It runs later, before
 those below it as usual, when a name of the package or another module below it is used: nothing is left out.
@@ -30,7 +30,7 @@ ELSEWHERE = {
 }
 """Modules with names that RLlib needs from deferred packages, to distinguish a checkpoint from a path (ray 2.60)."""
 NEEDED = (
-    "rlservo.export.rllib.new_stack",  # and what it imports of RLlib's
+    "rlservo.export.rllib.new_stack",  # and its imports from RLlib
     "ray.rllib.connectors.env_to_module",
     "ray.rllib.connectors.module_to_env",
     "ray.rllib.core.models.torch.encoder",
@@ -44,8 +44,8 @@ _TORCH_LIBRARY = "lib/libtorch_python.so"
 def prepare() -> None:
     """Let this process import less from now on; only for our own programs, as it changes how Ray's packages load.
 
-    torch's shared libraries are mapped while other modules are imported, which takes none of Python's lock: a quarter
-    of a second of torch's import.
+    torch's shared libraries are mapped while other modules are imported, without Python's lock: this saves a quarter of
+    a second.
     """
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
         sys.meta_path.insert(0, _Finder())
@@ -65,7 +65,7 @@ def _load_torch_library() -> None:
 def import_needed() -> None:
     """Import what restoring needs, and little else, in a process that was prepared for it.
 
-    Where another version of RLlib cannot be imported so, it is imported as usual.
+    If another version of RLlib cannot be imported this way, it is imported as usual.
     """
     finder = next((finder for finder in sys.meta_path if isinstance(finder, _Finder)), None)
     if finder is None or "ray.rllib" in sys.modules:

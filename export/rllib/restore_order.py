@@ -21,8 +21,8 @@ DECISIVE = ("_is_online", "create_local_env_runner", "num_env_runners")
 def connectors_that_rllib_restores(files: CheckpointFiles) -> Path:
     """Return the folder of training's pipelines.
 
-    It is the one found by name if RLlib restores none (recorded data) or the checkpoint has no configuration.
-    Raises CheckpointError where RLlib's folder is missing: the pipelines that are there are others'.
+    It is the one found by name if RLlib restores none (recorded data) or the checkpoint has no configuration. Raises
+    CheckpointError if RLlib's folder is missing: other pipelines that exist are not the policy's.
     """
     file = files.root / CTOR_FILE
     saved = read_config(unpickle_plain(file).get("ctor_args_and_kwargs")) if file.is_file() else {}

@@ -49,7 +49,7 @@ def check_spaces(
 
 
 def check_unsquashing(action_space: Any, transform: Transform) -> None:
-    """Raise UnsupportedError where RLlib's own unsquashing overflows: of 1 it computes `2 * (high - low)`."""
+    """Raise UnsupportedError if RLlib's own unsquashing overflows: for 1 it computes `2 * (high - low)`."""
     for name, space in space_leaves(action_space, "action").items():
         if not isinstance(space, Box) or leaf_transform(space, transform) != "unsquash":
             continue

@@ -18,7 +18,7 @@ from rlservo.export.contract.errors import CheckpointError, first_line
 from rlservo.export.contract.spaces import Element
 from rlservo.export.recipe.recipe import Affine
 
-# The end of an action term's class: the unit of what it commands, and where its default offset stands.
+# The end of an action term's class name: the unit of its command, and the key of its default offset.
 KINDS = {
     "JointPositionAction": ("rad", "joint_pos"),
     "JointVelocityAction": ("rad/s", "joint_vel"),
@@ -107,7 +107,7 @@ def _term(
     asset = str(term.get("asset_name") or term.get("entity_name") or "robot")
     state = _init_state(env, asset)
     patterns = [str(each) for each in term.get("joint_names") or term.get("actuator_names") or ()]
-    # Keys in alphabetical order have lost that of the joints.
+    # Alphabetical keys have lost the order of the joints.
     joints = _joints(patterns, {} if list(env) == sorted(env) else state, size, notes)
     count = len(joints) or size
     if count is None:
@@ -132,7 +132,7 @@ def _joints(patterns: Sequence[str], state: Mapping[str, Any], size: int | None,
     """Return the joints' names in the action's order; empty if only the robot's file has them.
 
     Isaac Lab writes env.yaml in the order of its settings, so the initial state lists the joints as the robot has them;
-    a file with sorted keys does not show.
+    a file with sorted keys does not show it.
     """
     if patterns and all(re.fullmatch(r"\w+", each) for each in patterns):
         return list(patterns)
@@ -145,7 +145,7 @@ def _joints(patterns: Sequence[str], state: Mapping[str, Any], size: int | None,
 
 
 def _values(given: Any, joints: Sequence[str], count: int, missing: float, what: str) -> list[float]:
-    """Return one number an element: of a number, a list, or a mapping from patterns of names."""
+    """Return one number per element, given a number, a list, or a mapping from patterns of names."""
     if isinstance(given, int | float):
         return [float(given)] * count
     if isinstance(given, list) and len(given) == count:

@@ -187,7 +187,6 @@ def _restore(file: Path) -> RestoredPolicy:
 
 
 def _stage(file: Path, model: Mapping[str, Any]) -> Any:
-    """Return a stage as a torch module."""
     import torch
 
     parameters = model["parameters"]

@@ -1,4 +1,4 @@
-"""An ONNX model of a network's usual operators as a torch module, so that it can be traced with what is around it."""
+"""An ONNX model of a network's usual operators as a torch module, so that it can be traced with the steps around it."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class OnnxStage(nn.Module):
                 )
 
     def _keep(self, name: str, tensor: Any) -> None:
-        """Keep numbers as weights, and whole numbers, which say shapes and places, as they are."""
+        """Keep floats as weights, and integers, which are shapes and indices, as they are."""
         values = numpy_helper.to_array(tensor)
         if values.dtype.kind != "f":
             self._places[name] = values
@@ -124,7 +124,7 @@ class OnnxStage(nn.Module):
         self.register_buffer(self._constants[name], torch.from_numpy(values.copy()))
 
     def forward(self, *given: Tensor) -> tuple[Tensor, ...]:
-        """Return the outputs, of inputs `[batch, ...]`."""
+        """Return the outputs for inputs `[batch, ...]`."""
         values = {**self._places, **{name: getattr(self, buffer) for name, buffer in self._constants.items()}}
         values.update(zip(self._inputs, given, strict=True))
         for kind, inputs, output, attributes in self._nodes:

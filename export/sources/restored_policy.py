@@ -18,7 +18,7 @@ from rlservo.export.recipe.trees import Tree
 def diverged_weights(module: nn.Module) -> Iterator[str]:
     """Yield the names of weights that show that training diverged: NaN, or infinite where training changes them.
 
-    A mask or a bound may be infinite. To be asked before the module is frozen.
+    A mask or a bound may be infinite. Call it before the module is frozen.
     """
     trained = {name for name, weights in module.named_parameters() if weights.requires_grad}
     for name, weights in module.state_dict().items():
@@ -40,9 +40,9 @@ Elements: TypeAlias = tuple[Element, ...] | Mapping[str, tuple[Element, ...]]
 
 @dataclass(frozen=True)
 class ElementNames:
-    """Element names in row-major order, empty where unknown, and the rate the environment asks for actions at [Hz].
+    """Element names in row-major order, empty where unknown, and the environment's control rate [Hz].
 
-    Of a nested space they are by the leaf's tensor name.
+    For a nested space, names are grouped by the leaf's tensor name.
     """
 
     observation: Elements = ()
@@ -60,7 +60,7 @@ class RestoredPolicy:
     start_loop: Callable[[], Loop]
     """Start the framework acting step after step, exploration off and filter frozen: the export's reference."""
     agents: tuple[str, ...] = ()
-    """The agents of an environment with several that it is for; empty if there is one, or all are alike."""
+    """The agents it is for, if the environment has several; empty if there is one, or all are alike."""
     elements: ElementNames | None = None
     """Names of its elements in the checkpoint; None if the environment's class has them."""
     untrained_filter: str = ""

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 AGENT, ENVIRONMENT = Path("params/agent.yaml"), Path("params/env.yaml")
 ACTORS = {"actor": "actor_state_dict", "student": "student_state_dict"}
-"""Which part of agent.yaml acts, by algorithm (PPO, distillation), and its weights in the checkpoint."""
+"""The part of agent.yaml that acts, by algorithm (PPO, distillation), and its weights in the checkpoint."""
 _MODEL = re.compile(r"model_(\d+)\.pt")
 
 
@@ -119,7 +119,7 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
     actor, acting = (_actor(file, agent, part, state_dict) for _ in range(2))
     groups = (agent.get("obs_groups") or {}).get(part) or ["policy"]
     if len(groups) > 1:
-        notify(f"an observation is the groups {', '.join(groups)} side by side, in this order")
+        notify(f"an observation concatenates the groups {', '.join(groups)}, in this order")
     size = acting.distribution.output_dim if acting.distribution is not None else state_dict[_last(state_dict)].shape[0]
     environment = file.parent / ENVIRONMENT
     limit = agent.get("clip_actions")

@@ -187,7 +187,7 @@ class Network(nn.Module):
         self._scores = Scores(policy, rule)
 
     def forward(self, obs: Tree, *state: list[Tensor]) -> tuple[Tensor, ...]:
-        """Return the action where its rule is the policy's own, one tensor for each of `names`, and the next state."""
+        """Return the action if its rule is the policy's own, one tensor for each of `names`, and the next state."""
         policy, rule = self.module, self._rule
         mask: Tensor | None = None
         next_state: list[Tensor] = []
@@ -289,7 +289,7 @@ def _rows(obs: Tree, rows: slice) -> Tree:
 def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     """Return the steps from one frame of the environment to the model's observation.
 
-    VecNormalize's own space says whether it comes before the stack, and of images whether their channels are last.
+    VecNormalize's own space says whether it comes before the stack, and for images whether their channels are last.
     Raises CheckpointError if the statistics or the number of frames do not fit the model.
     """
     models = _leaves(model_space)

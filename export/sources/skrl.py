@@ -81,7 +81,7 @@ class Skrl(Source):
 
 
 def find_run(path: Path) -> tuple[Path, Path] | None:
-    """Return (weights, agent.yaml) of the run that `path` is, is in, or holds; of several agents the newest."""
+    """Return (weights, agent.yaml) of the run that `path` is, is in, or holds; the newest if there are several."""
     if path.is_file():
         weights = path if path.suffix == ".pt" else None
     else:
@@ -104,7 +104,7 @@ def _restore(file: Path, agent_file: Path, notify: Notify) -> RestoredPolicy:
     kind = str((config.get("agent") or {}).get("class"))
     if kind.lower().endswith("_rnn"):
         raise UnsupportedError(
-            f"{file} is of a recurrent agent ({kind}), and agent.yaml does not say its models: make the agent in "
+            f"{file} is of a recurrent agent ({kind}), and agent.yaml does not describe its models: make the agent in "
             "Python and export it with rlservo.export_policy, as examples/skrl_recurrent.py does"
         )
     weights = _load(file)

@@ -30,7 +30,7 @@ ACTIONS = (Box, Discrete, MultiDiscrete)
 
 @dataclass(frozen=True)
 class ModuleFiles:
-    """A module stands where others have files."""
+    """A module in place of a checkpoint's files."""
 
     module: nn.Module
     module_id: str = "default_policy"

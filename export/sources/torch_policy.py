@@ -34,13 +34,13 @@ class TorchPolicy:
     """A source's module: the traced form and the framework's own."""
 
     recipe: Recipe
-    """Its mode is the kind of the module's output: the action ("given"), or scores to choose by ("argmax")."""
+    """Its mode names the module's output: the action ("given"), or scores to choose by ("argmax")."""
     module: nn.Module
-    """It holds all weights."""
+    """Module with all weights."""
     act: Callable[[Any, Tree, list[Tensor]], tuple[Tree, list[Tensor]]]
     """The traced function of module, observation and state: torch operations, without the recipe's steps."""
     reference: Callable[[], Act]
-    """Start the framework's own way to act, of an observation as the environment gives it, as torch tensors."""
+    """Start the framework's own way to act, for observations as the environment gives them, as torch tensors."""
     names: tuple[str, ...] = ()
     """`("q_values",)` or `("action_dist_inputs",)` if the output is scores."""
 
@@ -50,8 +50,8 @@ def restored(
 ) -> RestoredPolicy:
     """Return the policy for the exporter; `what` names the checkpoint in errors.
 
-    Raises CheckpointError for weights that are not finite, UnsupportedError for a module that does not run or gives
-    something else than the action space wants.
+    Raises CheckpointError for weights that are not finite, UnsupportedError for a module that does not run or whose
+    output does not fit the action space.
     """
     for key in diverged_weights(policy.module):
         raise CheckpointError(f"{what}: the weights '{key}' are not all finite: training diverged")
@@ -84,7 +84,7 @@ def _check_output(policy: TorchPolicy, what: str) -> None:
 
 
 def _check_shape(recipe: Recipe, values: list[NDArray[Any]], rows: int) -> None:
-    """Raise UnsupportedError if a module gives another shape than the action space needs."""
+    """Raise UnsupportedError if a module's output does not have the action space's shape."""
     spaces = list(recipe.action_leaves.values())
     if recipe.mode == "argmax":
         wanted, which = [(rows, sum(parameter_count(space) for space in spaces))], "scores"
@@ -93,7 +93,7 @@ def _check_shape(recipe: Recipe, values: list[NDArray[Any]], rows: int) -> None:
     got = [value.shape for value in values]
     if got != wanted:
         raise UnsupportedError(
-            f"it gives for {rows} observations {which} of shape {', '.join(map(str, got))}, the action space "
+            f"for {rows} observations it gives {which} of shape {', '.join(map(str, got))}, the action space "
             f"{recipe.action_space} expects {', '.join(map(str, wanted))}"
         )
 

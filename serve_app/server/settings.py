@@ -31,7 +31,7 @@ class ServerSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     threads: int = Field(1, ge=1, le=256)
-    """onnxruntime threads per session; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
+    """onnxruntime threads per policy; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
 
     max_body_bytes: int = Field(4 << 20, ge=1024)
     """A larger request body is refused with 413 before it is read to the end. A request for actions that is larger than
@@ -86,7 +86,7 @@ class ServerSettings(BaseModel):
     allowed_hosts: str = ""
     """Names, separated by commas, that requests may use for this server besides `localhost`, its own address and, if
     other machines can reach it, any address and the machine's name; `*` allows any. A server with API keys that other
-    machines can reach takes any name unless some are given here: a web page has no key."""
+    machines can reach accepts any name unless some are given here: a web page has no key."""
 
     default_policy: str | None = None
     """Policy of a WebSocket at `/`, where openpi's clients connect; if there is one policy, that one. Also set by
@@ -143,12 +143,12 @@ class ServerSettings(BaseModel):
     """A larger contract.json is refused before it is read."""
 
     plan: str | None = None
-    """Folder or URI whose `.plan` holds the aliases, canaries and shadows. By default the first writable place of
-    policies, else the user's state folder (`$XDG_STATE_HOME/rlservo`)."""
+    """Folder or URI whose `.plan` holds the aliases, canaries and shadows. By default the first policy folder
+    that is writable, else the user's state folder (`$XDG_STATE_HOME/rlservo`)."""
 
     load_timeout_s: float = Field(30.0, gt=0, allow_inf_nan=False)
-    """[s] Time limit for listing the places of policies, loading and proving one version, and reading or writing the
-    plan: a file system or storage may hang. One call to object storage may take half of it."""
+    """[s] Time limit for listing policies, loading and proving one version, and reading or writing the plan: a file
+    system or storage may hang. One call to object storage may take half of it."""
 
     cache: str | None = None
     """Local folder for versions fetched from remote repositories (`rlservo serve s3://...`); replicas share it. By
@@ -158,8 +158,8 @@ class ServerSettings(BaseModel):
     """Largest size of the cache: the least recently used versions are removed, never those in use."""
 
     poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
-    """[s] How often to look for new versions in the places of policies and load them, as `rlservo policy load` does:
-    ready but not in use. Off by default. Also set by `rlservo serve --poll`."""
+    """[s] How often to look for new versions of policies and load them, as `rlservo policy load` does: ready but
+    not in use. Off by default. Also set by `rlservo serve --poll`."""
 
     @property
     def bundle_limits(self) -> BundleLimits:

@@ -187,7 +187,7 @@ class SetCanary(Command):
     verb = "canary"
     summary = "Give another version a share of the sessions"
     version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
-    share: float | None = Field(None, ge=0, le=1, description="Of the sessions; 0 ends the canary.")
+    share: float | None = Field(None, ge=0, le=1, description="Share of the sessions; 0 ends the canary.")
 
     @property
     def words(self) -> str:

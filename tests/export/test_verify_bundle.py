@@ -188,8 +188,8 @@ def test_elements_that_do_not_fit_stay_unnamed_with_a_notice(toy: str, notices: 
 def test_an_environment_that_cannot_be_asked_is_a_notice(env_id: str, notices: list[str]) -> None:
     assert read_elements(env_id, {}, toy_recipe(), notices.append).observation == ()
     (notice,) = notices
-    assert notice.startswith("the elements stay without names, which changes nothing else")
-    assert f"environment {env_id} cannot be asked" in notice
+    assert notice.startswith("the elements stay unnamed, which changes nothing else")
+    assert f"environment {env_id} cannot name them" in notice
 
 
 def test_an_environment_that_names_nothing_is_no_notice(notices: list[str]) -> None:

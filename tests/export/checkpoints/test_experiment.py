@@ -1,4 +1,4 @@
-"""Picking a checkpoint out of what Tune leaves behind."""
+"""Choice of a checkpoint from a Tune experiment's folder."""
 
 from __future__ import annotations
 

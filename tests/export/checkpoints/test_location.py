@@ -1,4 +1,4 @@
-"""Paths that a person may point at, and the message when one is not a checkpoint."""
+"""Paths that a user may give, and the message if one is not a checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints behind URIs: fetched by the file systems that Ray itself uses, and gone again afterwards."""
+"""Checkpoints behind URIs: fetched by the file systems that Ray itself uses, and removed afterwards."""
 
 from __future__ import annotations
 

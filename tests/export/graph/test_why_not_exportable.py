@@ -63,7 +63,7 @@ def test_a_number_that_left_torch_is_told_with_its_place(tmp_path: Path) -> None
 
 
 def test_a_torch_without_its_class_of_warnings_tells_every_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # From us alone: torch goes on raising it.
+    # Only from us: torch continues to raise it.
     monkeypatch.setattr(why_not_exportable, "getattr", lambda _owner, _name, otherwise: otherwise, raising=False)
     assert why_not_exportable.tracer_warning() is Warning
     lines = {function: inspect.getsourcelines(function)[1] + 1 for function in (freezes, advises)}

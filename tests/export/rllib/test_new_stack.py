@@ -144,7 +144,7 @@ def test_an_operator_without_an_onnx_form_is_one_sentence_on_the_command_line(
     )
     written = done.stdout + done.stderr
     assert not any(words in written for words in ("\x1b", "Traceback", "Next steps", "step 3/3"))
-    assert "the elements stay without names, which changes nothing else" in written
+    assert "the elements stay unnamed, which changes nothing else" in written
     assert not (tmp_path / "out").exists()
 
 

@@ -1,4 +1,4 @@
-"""Checkpoints that older Rays wrote, against the actions that those Rays themselves computed."""
+"""Checkpoints that older Ray releases wrote, against the actions that those releases themselves computed."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_a_ray_without_an_attribute_is_refused_by_version(
     files = locate_checkpoint(request.getfixturevalue(fixture) / checkpoint, module_id)
 
     def hide(piece: Any, attribute: str) -> Any:
-        """Stand in for a Ray whose class calls the attribute otherwise, to us alone: RLlib's own code goes on."""
+        """Stand in for a Ray whose class names the attribute otherwise, only for us: RLlib's own code is unaffected."""
         renamed = attribute == name and owner in {kind.__name__ for kind in type(piece).__mro__}
         return getattr(piece, f"{name}_of_another_ray" if renamed else attribute)
 

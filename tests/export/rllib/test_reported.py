@@ -1,4 +1,4 @@
-"""Checkpoints of the kinds that people brought, against what RLlib did in its own rollout."""
+"""Checkpoints of the kinds that users reported, against what RLlib did in its own rollout."""
 
 from __future__ import annotations
 
