@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-MAX_MODEL_ERROR = 0.5  # of a figure of the model: half of it
+MAX_MODEL_ERROR = 0.5  # share of a figure of the model
 
 Extreme = Literal["target", "start"]
 """Placements outside the task: the target out of reach, or the robot in a corner."""
@@ -31,7 +31,7 @@ class HasRobotModels(Protocol):
     """An environment whose robot can be replaced by another of the same kind."""
 
     def set_robot_model(self, name: str) -> None:
-        """Exchange the robot; call `reset` next. Raises ValueError for a model that does not exist."""
+        """Replace the robot; call `reset` next. Raises ValueError for a model that does not exist."""
         ...
 
 

@@ -1,6 +1,6 @@
 """Domain randomisation: latency, noise, payload and model errors, drawn for each episode.
 
-A wrapper for every Gymnasium environment: delays and losses need nothing of it, noise a vector of numbers, the rest an
+A wrapper for every Gymnasium environment: delays and losses work with any, noise needs a vector of numbers, the rest an
 environment of this package or one with the methods in `disturbances.py`.
 """
 
@@ -66,13 +66,12 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     and the `draw_model_error` of the two simulations. Only UR arms carry a payload. An arm whose base stands elsewhere
     gets wrong positions of targets and objects; a mobile robot whose localisation is off, of the target.
 
-    Until the first delayed action takes effect the robot does nothing new: the first action of the episode is what it
-    repeats. Until there is an old observation the first one is given. Of observations that arrive late or not at all,
-    the newest that has arrived is given again. Noisy observations are clipped to the space. Rewards and endings are
-    judged on what really happened.
+    Until the first delayed action takes effect the robot repeats the first action of the episode. Until there is an old
+    observation the first one is given. While observations are late or lost, the newest that has arrived is given again.
+    Noisy observations are clipped to the space. Rewards and endings are judged on what really happened.
 
     `reset(seed=...)` seeds the environment and this wrapper; the same seed and actions give the same episode, and one
-    disturbance more does not change what the others draw. The drawn values are in `info["randomization"]` of `reset`.
+    disturbance more does not change what the others draw. The drawn values are in `info["randomization"]` from `reset`.
     Without arguments the wrapper changes nothing. Options given to `reset` take precedence over those of `extreme`.
 
     Raises ValueError for a range that is empty or negative, errors that do not fit the observation, and what the

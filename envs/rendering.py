@@ -86,7 +86,7 @@ class RenderedEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:  # noqa: ARG002
         """Return options of `reset` for an episode that starts at the task's pose, at random, or at the robot's pose.
 
-        With `keep_target` the target stays as well. A task that cannot start so starts in its own way.
+        With `keep_target` the target stays as well. A task that cannot start there starts in its own way.
         """
         return {}
 

@@ -1,7 +1,7 @@
 """Base of the MiR100's tasks: drive to a target, scored by the distance gained and the power spent.
 
-A task adds where things start, what ends an episode badly, and which lasers it looks at. Source of every figure here:
-jr-robotics/robo-gym 2.0.1, envs/mir100.
+A task adds the start positions, the failures that end an episode, and the lasers it observes. Source of every figure
+here: jr-robotics/robo-gym 2.0.1, envs/mir100.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ class Mir100Navigation(RenderedEnv):
         super().close()
 
     def limited(self) -> dict[str, int] | None:
-        """Return in how many commands each limit of a real base was kept; None for a simulated one."""
+        """Return the number of commands in which each limit of a real base applied; None for a simulated one."""
         return self.simulation.limited()
 
     def take_over(self) -> None:
@@ -246,8 +246,8 @@ class Mir100Navigation(RenderedEnv):
     def show_observations(self, observations: NDArray[np.floating[Any]], row: int) -> None:
         """Put the robot at the pose of an episode's observations, relative to the target, which is at the origin.
 
-        The heading is not observed: it is integrated from the velocities since the episode began.
-        Between the fixes of a target that is observed rarely, the way is summed up likewise.
+        The heading is not observed: it is integrated from the velocities since the episode began. Between the fixes of
+        a target that is observed rarely, the path is integrated likewise.
         """
         x, y, yaw = _dead_reckoning(observations[: row + 1].astype(np.float64))
         self.simulation.place((x, y, yaw), target=(0.0, 0.0, 0.0))
@@ -298,7 +298,7 @@ class Mir100Navigation(RenderedEnv):
         return self._polar(target_x, target_y)
 
     def _told_target_polar(self) -> tuple[float, float]:
-        """Return the policy's observation, from the pose that the robot believes to have."""
+        """Return the policy's observation, from the pose that the robot believes it has."""
         (target_x, target_y, _), (dx, dy) = self.simulation.target, self._base_offset
         return self._polar(target_x + dx, target_y + dy)
 

@@ -66,7 +66,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
     | max_steps_exceeded | 500 steps | truncated |
 
     Any of the 1,012 beams counts. A corner (+-0.45, +-0.29 m) is near a cube when within 0.40 m of the cube's centre.
-    Where success and collision fall into one step, it is a success. The last step's info also holds `is_success`.
+    If success and collision fall into one step, it is a success. The last step's info also holds `is_success`.
 
     ## Reset options
 

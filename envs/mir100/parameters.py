@@ -1,7 +1,7 @@
 """Parameters of the MiR100. Everything else about the robot is computed from them.
 
 Sources: body, wheels, scanner poses, scanner range and noise from the robot description of DFKI-NI/mir_robot
-(mir_100_v1.urdf.xacro, sick_s300.urdf.xacro), speed limits and the time-out from its diff_drive_controller settings
+(mir_100_v1.urdf.xacro, sick_s300.urdf.xacro), speed limits and the timeout from its diff_drive_controller settings
 (diffdrive_controller.yaml), the dropped beams, the 0.04 m rule and the cycle from jr-robotics/robo-gym-robot-servers
 (mir100_robot_server). The robot frame is base_link: its origin on the floor below the middle of the wheel axle, x
 ahead, y to the left, z up.

@@ -14,7 +14,7 @@ from rlservo.envs.rendering import Start
 
 
 class _RealBase(Mir100Navigation):
-    """What a real base changes: an episode begins where it stands, and its world is not known."""
+    """Differences of a real base: an episode begins where it stands, and its world is not known."""
 
     RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("target_pose",)
 
@@ -41,19 +41,19 @@ class _RealBase(Mir100Navigation):
 
 
 class NoObstacleNavigationMir100Rob(_RealBase, NoObstacleNavigationMir100Sim):
-    """`NoObstacleNavigationMir100Sim` on a real base: `robot` is 'ros2:' or 'rosbridge://192.168.12.20:9090', say.
+    """`NoObstacleNavigationMir100Sim` on a real base; `robot` is 'ros2:' or 'rosbridge://HOST:9090'.
 
     Observations, actions, rewards and endings are the simulated environment's, computed from odometry, in whose frame
-    `target_pose` and the boundary are; a base that stops ends the episode with what stopped it as `final_status`
+    `target_pose` and the boundary are; a base that stops ends the episode, with the reason as `final_status`
     (connection_lost, stale_observation). A step lasts a control cycle of real time. An episode begins where the base
-    stands. Of its own are `limits` (names and defaults: `rlservo.envs.ros2.base.BaseLimits`), `confirm` (False:
-    `reset` does not ask), and `info["robot"]`: the state, its changes, and the limits that were kept.
+    stands. It adds `limits` (names and defaults: `rlservo.envs.ros2.base.BaseLimits`), `confirm` (False: `reset` does
+    not ask), and `info["robot"]`: the state, its changes, and the limits that applied.
     """
 
 
 class ObstacleAvoidanceMir100Rob(_RealBase, ObstacleAvoidanceMir100Sim):
-    """`ObstacleAvoidanceMir100Sim` on a real base; what `NoObstacleNavigationMir100Rob` says holds here too.
+    """`ObstacleAvoidanceMir100Sim` on a real base, with the additions of `NoObstacleNavigationMir100Rob`.
 
-    The readings are those of the MiR100's own two scans where they are published, else computed from one scan around
+    The readings are those of the MiR100's own two scans if they are published, else computed from one scan around
     base_link. A collision is a reading below 0.15 m: walls and cubes are not known.
     """

@@ -48,7 +48,7 @@ class Mir100Simulation:
     """One robot in one world ("empty" or "lab_6x8"), at 100 Hz physics.
 
     `laser_noise` is the standard deviation of a reading [m]; 0 gives exact distances. The noise is drawn from `rng`,
-    which may be exchanged at any time; without one it differs from run to run.
+    which may be replaced at any time; without one it differs from run to run.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Mir100Simulation:
         return None
 
     def limited(self) -> dict[str, int] | None:
-        """Return in how many commands each limit of a real base was kept."""
+        """Return the number of commands in which each limit of a real base applied."""
         return None
 
     def take_over(self) -> None:

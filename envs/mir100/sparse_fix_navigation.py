@@ -10,15 +10,15 @@ from typing import Any
 from rlservo.envs.mir100.navigation import Observation
 from rlservo.envs.mir100.no_obstacle_navigation import NoObstacleNavigationMir100Sim
 
-FIX_INTERVAL = 20  # control cycles: one fix in 2 s
+FIX_INTERVAL = 20  # control cycles: one fix every 2 s
 
 
 class SparseFixNavigationMir100Sim(NoObstacleNavigationMir100Sim):
-    """Drive a MiR100 to within 0.2 m of a target whose place it gets once in two seconds.
+    """Drive a MiR100 to within 0.2 m of a target whose position it gets once every two seconds.
 
-    The task is `rlservo/NoObstacleNavigationMir100Sim-v0`, as a robot has it whose localisation is slow: the
-    odometry speaks every cycle, a beacon or marker gives a fix every `fix_interval` cycles. In
-    between a policy must remember the last fix and the velocities since, to know the target's position.
+    The task is `rlservo/NoObstacleNavigationMir100Sim-v0`, for a robot whose localisation is slow: odometry arrives
+    every cycle, and a beacon or marker gives a fix every `fix_interval` cycles. In between a policy must remember the
+    last fix and the velocities since, to know the target's position.
 
     ## Observation: Box(4,), float32
 
@@ -29,7 +29,7 @@ class SparseFixNavigationMir100Sim(NoObstacleNavigationMir100Sim):
     | 2 | linear_velocity, ahead positive | m/s | -1.1 .. 1.1 |
     | 3 | angular_velocity, to the left positive | rad/s | -1.6 .. 1.6 |
 
-    `reset` returns a fix, and so do steps `fix_interval`, `2 * fix_interval` and so on. A distance of 0 never is one:
+    `reset` returns a fix, and so do steps `fix_interval`, `2 * fix_interval` and so on. A distance of 0 is never one:
     an episode ends nearer than 0.2 m.
 
     ## Action, reward, endings, reset options

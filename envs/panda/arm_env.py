@@ -103,8 +103,8 @@ class EmptyEnvironmentPandaSim(PandaArmEnv):
     ## Action: Box(6,), float32, -1 .. 1
 
     Absolute joint positions, normalised alike, one element per joint that is not fixed (panda_joint7 is). The arm moves
-    towards them in max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the motion
-    a cycle later. A fixed joint is commanded to its position at reset. An action outside the space raises
+    towards them in max(0.5 s, slowest joint's travel / (scale * velocity limit)), and the next action replaces the
+    motion a cycle later. A fixed joint is commanded to its position at reset. An action outside the space raises
     `InvalidActionError` naming the element and the excess.
 
     ## Reward and endings

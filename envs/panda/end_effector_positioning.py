@@ -45,7 +45,7 @@ class EndEffectorPositioningPandaSim(PandaArmEnv):
 
     ## Action: Box(6,), float32, -1 .. 1
 
-    As of `EmptyEnvironmentPandaSim`: absolute joint positions, panda_joint7 fixed.
+    As in `EmptyEnvironmentPandaSim`: absolute joint positions, panda_joint7 fixed.
 
     ## Reward
 
@@ -69,7 +69,7 @@ class EndEffectorPositioningPandaSim(PandaArmEnv):
 
     ## Constructor
 
-    As of `EmptyEnvironmentPandaSim`, and `randomize_start` (the default of the reset option).
+    As in `EmptyEnvironmentPandaSim`, and `randomize_start` (the default of the reset option).
     """
 
     RESET_OPTIONS = ("joint_positions", "ee_target_pose", "randomize_start")
@@ -99,7 +99,7 @@ class EndEffectorPositioningPandaSim(PandaArmEnv):
         return -high, high
 
     def sensor_errors(self) -> dict[str, SensorError]:
-        """Return what real sensors add; joints as a UR's, whose repeatability the Panda's data sheet has too."""
+        """Return real sensors' errors; the joints' are a UR's: the Panda's data sheet states the same repeatability."""
         joints = {
             f"{joint}_position_normalized": SensorError(JOINT_NOISE / half, JOINT_BIAS / half)
             for joint, half in zip(JOINTS, HALF.tolist(), strict=True)
@@ -110,7 +110,7 @@ class EndEffectorPositioningPandaSim(PandaArmEnv):
     # -- for viewers, and for learning from a solution
 
     def target_position(self) -> Vector:
-        """Return where the target is in MuJoCo's world [m] (3,)."""
+        """Return the target's position in MuJoCo's world [m] (3,)."""
         return self._target + self.BASE
 
     def move_target(self, position: ArrayLike) -> None:

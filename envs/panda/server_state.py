@@ -1,4 +1,4 @@
-"""State of the Panda as robo-gym's robot server reports it: a number by each name that its rs_mode has.
+"""State of the Panda as robo-gym's robot server reports it: one number for each name in its rs_mode.
 
 Source: jr-robotics/robo-gym-robot-servers, panda_robot_server. Joints are `joint1` to `joint7` there.
 """

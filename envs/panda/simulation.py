@@ -1,4 +1,4 @@
-"""The simulated Panda: what `ArmSimulation` says, with seven joints; poses are in robo-gym's `world`, the base's frame.
+"""The simulated Panda: `ArmSimulation` with seven joints; poses are in robo-gym's `world`, the base's frame.
 
 robo-gym's Panda sends positions straight to Gazebo's controllers, which know the velocity limits only as a scale; here
 a command is a trajectory within the scaled limits, as a UR's is.

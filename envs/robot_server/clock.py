@@ -1,14 +1,14 @@
 """Clock of a robot server: a cycle ends at once (`fast`), or when its real time is over (`real`).
 
-Either way the same calls give the same trajectory. In real time a client that does not keep pace is waited for, up to
-half a second; beyond that time continues without it, as it does on the robot.
+Either way the same calls give the same trajectory. In real time the clock waits up to half a second for a client that
+does not keep pace; after that, time continues without it, as on the robot.
 """
 
 from __future__ import annotations
 
 import time
 
-GRACE_S = 0.5  # [s]; the MiR100's own command time-out
+GRACE_S = 0.5  # [s]; the MiR100's own command timeout
 MAX_CATCH_UP_S = 60.0  # [s] of simulation; after a longer silence the rest is not simulated
 
 

@@ -118,9 +118,9 @@ class RobotServers:
         self.kill_all()
 
     def _start_off_the_managers_ports(self, settings: Settings) -> ServerProcess:
-        """Start a server; start it again if the system gave it a port on which clients look for a manager.
+        """Start a server; start it again if the system gave it a port that it must not have.
 
-        Or one whose last client may still ask for its end: that would end the new server.
+        Clients look for a manager on some ports; on others a former server's last client may still ask for its end.
         """
         rejects: list[ServerProcess] = []
         try:

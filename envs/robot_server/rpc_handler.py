@@ -35,7 +35,7 @@ def rpc_handler(
                 message = call(request)
             except (DecodeError, ValueError) as error:
                 is_garbage = isinstance(error, DecodeError)
-                reason = f"{len(request)} bytes that are not such a message" if is_garbage else str(error)
+                reason = f"{len(request)} bytes that are not a valid message" if is_garbage else str(error)
                 if is_new(f"{name}: {reason}"):
                     log.error("%s: %s", name, reason)
                 message = fail(name, reason)

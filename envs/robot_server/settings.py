@@ -64,8 +64,8 @@ class ArmSettings(Common):
 
     RS_MODES: ClassVar[Mapping[str, int]]  # how many objects a mode's state has
     ACTION_MODES: ClassVar[tuple[str, ...]] = ACTION_MODES
-    FRAMES: ClassVar[tuple[str, ...]]  # poses can be in
-    EE_FRAMES: ClassVar[tuple[str, ...]]  # the end effector can be
+    FRAMES: ClassVar[tuple[str, ...]]  # for poses
+    EE_FRAMES: ClassVar[tuple[str, ...]]  # for the end effector
 
     rs_mode: str = "only_robot"
     action_mode: str = "abs_pos"
@@ -105,7 +105,7 @@ class ArmSettings(Common):
 
     @property
     def table(self) -> Table:
-        """Which table the arm stands on, if any."""
+        """The table that the arm stands on, if any."""
         return ARM_WORLDS[_plain(self.world)]
 
 

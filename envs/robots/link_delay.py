@@ -1,10 +1,10 @@
-"""Delay of messages whose stamps are of another clock: by how much one took longer than usual."""
+"""Delay of messages whose stamps come from another clock: how much longer than usual one took."""
 
 from __future__ import annotations
 
 import math
 
-CREEP = 0.001  # [s/s], of two clocks that drift; a link's delay that grows faster is one
+CREEP = 0.001  # [s/s], drift between two clocks; a delay that grows faster is the link's
 
 
 class LinkDelay:

@@ -56,7 +56,7 @@ class RosArmConnection:
         self._joints = [address["prefix"] + name for name in JOINT_NAMES.values()]
         self._lock = threading.Lock()
         self._state: tuple[float, float | None, Vector, Vector] | None = None  # stamp, age, positions, velocities
-        self._problem = f"no message on {address['joint_states']}: is the driver running, and ROS_DOMAIN_ID its own"
+        self._problem = f"no message on {address['joint_states']}: is the driver running, with this ROS_DOMAIN_ID"
         self._speed_percent = 100.0 if address["status"] == "off" else float("nan")
         self._modes: dict[str, int] = {"program_running": 1, "robot_mode": RUNNING, "safety_mode": 1}
         self._setpoint: Vector | None = None

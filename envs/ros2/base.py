@@ -1,7 +1,7 @@
 """A mobile base behind ROS: state in, velocities within limits out, at 20 Hz from its own thread.
 
-If its process dies, the base's own time-out of velocity commands stops it (diff_drive_controller and the MiR100: 0.5
-s), as it does if the network fails.
+If its process dies, the base's own timeout of velocity commands stops it (diff_drive_controller and the MiR100: 0.5 s),
+as it does if the network fails.
 """
 
 from __future__ import annotations
@@ -283,7 +283,7 @@ class RosBase:
         given_s, (linear, angular) = self._setpoint
         odometry = next(iter(self._inputs.values()))
         if odometry.age() > LOST_S and not self.fault:
-            self.fault = f"connection_lost: no odometry on {self.address['odom']} for {LOST_S:g} s: see its network"
+            self.fault = f"connection_lost: no odometry on {self.address['odom']} for {LOST_S:g} s: check its network"
         if self.fault:
             self.phase = Phase.FAULT
         elif self._order == Order.FREE:

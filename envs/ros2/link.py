@@ -91,9 +91,9 @@ def wait_until(condition: Callable[[], bool], what: Callable[[], str] | str, tim
 
 
 def check_clock(topic: str, age_s: float) -> None:
-    """Raise RobotError for stamps that are of another clock."""
+    """Raise RobotError for stamps that come from another clock."""
     if age_s > CLOCK_TOLERANCE_S:
-        raise RobotError(f"{topic} has stamps {age_s:.1f} s old: synchronise the clocks (chrony), or say clock=robot")
+        raise RobotError(f"{topic} has stamps {age_s:.1f} s old: synchronise the clocks (chrony), or set clock=robot")
 
 
 def take_command(link: Link, topic: str, kind: str) -> Publish:

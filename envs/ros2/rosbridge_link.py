@@ -97,6 +97,6 @@ class RosbridgeLink:
         caller = self._library.Service(self._ros, f"/rosapi/{service}", kind)
         try:
             answer: Mapping[str, Any] = caller.call(self._library.ServiceRequest({"topic": topic}), timeout=CALL_S)
-        except Exception as error:  # a time-out or the bridge's refusal
+        except Exception as error:  # a timeout or the bridge's refusal
             raise RobotError(f"the rosbridge does not answer /rosapi/{service} for {topic}: {error}") from error
         return answer

@@ -107,7 +107,7 @@ class SimulatedArm:
             self.controller.servo(message.data, LOOKAHEAD_S)
 
     def _take_velocity(self, message: Any) -> None:
-        """Apply a velocity until the next one comes: the controller has no time-out."""
+        """Apply a velocity until the next one comes: the controller has no timeout."""
         if self._is_ready(message.data, 6):
             self.controller.speed(message.data, VELOCITY_ACCELERATION)
 

@@ -50,7 +50,7 @@ log = logging.getLogger("rlservo.robot")
 
 
 class SimulatedBase:
-    """The base: its drive with a time-out and limits, and its scanners."""
+    """The base: its drive with a timeout and limits, and its scanners."""
 
     def __init__(self, links: Sequence[Topics], *, world: str, is_stamped: bool, faults: LinkFaults) -> None:
         """Offer the topics on all links. Raises ValueError for an unknown world."""

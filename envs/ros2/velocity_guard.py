@@ -1,6 +1,6 @@
 """Guard of a velocity topic: publishes zeros when its standard input falls silent, and once when it ends.
 
-ros2_control's forward velocity controller has no time-out: the arm of a killed process would continue to move.
+ros2_control's forward velocity controller has no timeout: the arm of a killed process would continue to move.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
     LOW: ClassVar[Vector]  # [rad], of JOINTS
     HIGH: ClassVar[Vector]
     BASE: ClassVar[Vector]  # [m], the arm's base in MuJoCo's world
-    FIXED: ClassVar[tuple[str, ...]] = ()  # joints that are fixed where the constructor says nothing of them
+    FIXED: ClassVar[tuple[str, ...]] = ()  # joints that are fixed unless the constructor says otherwise
     START_JOINTS: ClassVar[tuple[float, ...]]  # [rad]
     MAX_STEPS: ClassVar[int]
     RESET_OPTIONS: ClassVar[tuple[str, ...]]
@@ -335,7 +335,7 @@ class URArmEnv(ArmEnv[URSimulation]):
             gui=gui,
             render_mode=render_mode,
         )
-        self._simulations = {ur_model: self.simulation}  # an arm that comes again is not built again
+        self._simulations = {ur_model: self.simulation}  # an arm that is chosen again is not built again
 
     def close(self) -> None:
         """Free the GL context, close the window, and stop a real arm."""
@@ -346,7 +346,7 @@ class URArmEnv(ArmEnv[URSimulation]):
     def set_robot_model(self, name: str) -> None:
         """Put another arm on the table; call `reset` next. Raises ValueError naming the seven, and for a real arm."""
         if self.is_real:
-            raise ValueError(f"a real arm cannot be exchanged for {name!r}")
+            raise ValueError(f"a real arm cannot be replaced by {name!r}")
         simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
         if simulation is not self.simulation:
             self.simulation = simulation

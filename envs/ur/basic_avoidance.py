@@ -47,8 +47,8 @@ class BasicAvoidanceURSim(URArmEnv):
     ## Action: Box(5,), float32, -1 .. 1
 
     Offset in rad from the start joints, one element per joint that is not fixed, in the order above. The arm moves
-    there in max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the motion 0.05 s
-    later. A fixed joint is commanded to its start position. An action outside the space raises `InvalidActionError`
+    there in max(0.5 s, slowest joint's travel / (scale * velocity limit)), and the next action replaces the motion 0.05
+    s later. A fixed joint is commanded to its start position. An action outside the space raises `InvalidActionError`
     naming the element and the excess.
 
     ## Reward

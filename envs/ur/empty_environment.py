@@ -28,8 +28,8 @@ class EmptyEnvironmentURSim(URArmEnv):
     ## Action: Box(5,), float32, -1 .. 1
 
     Absolute joint positions over 2 pi (elbow: pi), one element per joint that is not fixed, in the order above. The arm
-    moves towards them in max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the
-    motion 0.05 s later. A fixed joint is commanded to its position at reset. An action outside the space raises
+    moves towards them in max(0.5 s, slowest joint's travel / (scale * velocity limit)), and the next action replaces
+    the motion 0.05 s later. A fixed joint is commanded to its position at reset. An action outside the space raises
     `InvalidActionError` naming the element and the excess.
 
     ## Reward

@@ -49,12 +49,12 @@ class EndEffectorPositioningURSim(URArmEnv):
 
     ## Action: Box(5,), float32, -1 .. 1
 
-    Absolute joint positions, one element per joint that is not fixed, in the order above: `position / 2 pi`
-    (elbow: `/ pi`); with `restrict_wrist_1`, wrist_1 maps -1 .. 1 to -3.48 .. 0.31 rad instead. The arm moves towards
-    them in max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the motion 0.1 s
-    later. A fixed joint is commanded to its position at reset (`fix_wrist_1` together with `restrict_wrist_1` sends
-    that value through the restricted mapping, as robo-gym does: pass `restrict_wrist_1=False` with it).
-    An action outside the space raises `InvalidActionError` naming the element and the excess.
+    Absolute joint positions, one element per joint that is not fixed, in the order above: `position / 2 pi` (elbow:
+    `/ pi`); with `restrict_wrist_1`, wrist_1 maps -1 .. 1 to -3.48 .. 0.31 rad instead. The arm moves towards them in
+    max(0.5 s, slowest joint's travel / (scale * velocity limit)), and the next action replaces the motion 0.1 s later.
+    A fixed joint is commanded to its position at reset (`fix_wrist_1` together with `restrict_wrist_1` sends that value
+    through the restricted mapping, as robo-gym does: pass `restrict_wrist_1=False` with it). An action outside the
+    space raises `InvalidActionError` naming the element and the excess.
 
     ## Reward
 
@@ -264,13 +264,13 @@ class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
     """The same task on a real arm: `robot` is for example 'rtde://192.168.0.2'.
 
     Observations, actions, rewards and endings are the simulated environment's, computed from the measured joints; a
-    robot that stops ends the episode with what stopped it as `final_status` (protective_stop, emergency_stop,
+    robot that stops ends the episode, with the reason as `final_status` (protective_stop, emergency_stop,
     program_stopped, connection_lost, stale_observation ...). A step lasts a control cycle of real time. `reset` moves
     the arm slowly to its start, in a straight line of joint space, after asking at the terminal.
 
-    Of its own are `limits` (names and defaults: `rlservo.envs.robots.limits.Limits`), `confirm` (False: `reset` does
-    not ask), `metrics` (HOST:PORT at which Prometheus reads state and limits), and `info["robot"]`: the state, its
-    changes, and the limits that were kept since the last step.
+    It adds `limits` (names and defaults: `rlservo.envs.robots.limits.Limits`), `confirm` (False: `reset` does not ask),
+    `metrics` (HOST:PORT at which Prometheus reads state and limits), and `info["robot"]`: the state, its changes, and
+    the limits that applied since the last step.
     """
 
     def __init__(self, *, robot: str = "", **arguments: Any) -> None:

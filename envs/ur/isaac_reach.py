@@ -51,8 +51,8 @@ class IsaacReachURSim(URArmEnv):
     ## Action: Box(6,), float32
 
     Joint positions as (position - default pose) / 0.5 rad, within the joint limits. The arm moves towards them in
-    max(0.5 s, slowest joint's way / (scale * velocity limit)), and the next action replaces the motion a cycle later.
-    An action outside the space raises `InvalidActionError` naming the element and the excess.
+    max(0.5 s, slowest joint's travel / (scale * velocity limit)), and the next action replaces the motion a cycle
+    later. An action outside the space raises `InvalidActionError` naming the element and the excess.
 
     ## Reward
 
@@ -111,7 +111,7 @@ class IsaacReachURSim(URArmEnv):
         self._target_rotation: Vector = np.eye(3)
         self._yaw = 0.0
         self._command: Vector = np.zeros(6)
-        self._end: Vector | None = None  # where an episode ended that another one may begin at
+        self._end: Vector | None = None  # where an episode ended, if the next one may begin there
 
     @classmethod
     def _observation_elements(cls) -> list[tuple[str, str]]:
@@ -134,7 +134,7 @@ class IsaacReachURSim(URArmEnv):
         return (-LIMITS - default) / ACTION_SCALE, (LIMITS - default) / ACTION_SCALE
 
     def sensor_errors(self) -> dict[str, SensorError]:
-        """Return what a real arm's sensors add; the target is a command, and known exactly."""
+        """Return the errors of a real arm's sensors; the target is a command, and known exactly."""
         return {
             f"{joint}_position_offset": SensorError(JOINT_NOISE, JOINT_BIAS) for joint in JOINTS
         } | velocity_errors()
@@ -142,7 +142,7 @@ class IsaacReachURSim(URArmEnv):
     # -- for viewers, and for learning from a solution
 
     def target_position(self) -> Vector:
-        """Return where the target is in MuJoCo's world [m] (3,)."""
+        """Return the target's position in MuJoCo's world [m] (3,)."""
         return self._target + BASE
 
     def move_target(self, position: ArrayLike) -> None:

@@ -150,7 +150,7 @@ def interpolate(points: NDArray[np.float64], count: int) -> Path:
     """Return `count` positions, both ends included, evenly in the parameter of the curve through `points` (n, 3).
 
     The curve is the cubic spline of scipy's `splprep(points, s=0)`: parameterised by the chords' lengths, with the
-    not-a-knot condition at both ends. Raises ValueError for fewer than four points and where two neighbours coincide.
+    not-a-knot condition at both ends. Raises ValueError for fewer than four points, or if two neighbours coincide.
     """
     if len(points) < 4:
         raise ValueError(f"the spline has {len(points)} points: expected at least 4")

@@ -1,4 +1,4 @@
-"""State of the arm as robo-gym's robot server reports it: a number by each name that its rs_mode has."""
+"""State of the arm as robo-gym's robot server reports it: one number for each name in its rs_mode."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def state_dict(arm: URSimulation, rs_mode: str, *, is_turned: bool = False) -> d
 
 
 def object_transform(arm: ArmSimulation, index: int, is_turned: bool = False) -> Transform:
-    """Return where an object is, in base_link or the controller's `base`."""
+    """Return an object's pose, in base_link or the controller's `base`."""
     x, y, z = arm.object_position(index).tolist()
     # Objects are placed in the reference frame and never turn in it.
     return (-x, -y, z, 0.0, 0.0, 0.0, 1.0) if is_turned else (x, y, z, 0.0, 0.0, 0.0, 1.0)

@@ -23,7 +23,7 @@ from rlservo.envs.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.envs.ur.parameters import JOINTS, ur_parameters
 
 MIN_TRAJECTORY_S = 0.5  # [s], the robot server never plans a shorter one
-SETTLE_CYCLES = 20  # the robot server lets so many pass after it has set a state
+SETTLE_CYCLES = 20  # the robot server lets this many pass after it has set a state
 
 # Of a camera.
 VIEW: dict[str, Any] = {"lookat": (0.0, 0.05, 0.42), "distance": 2.3, "azimuth": 145.0, "elevation": -18.0}
@@ -52,8 +52,6 @@ class _DataSheet(NamedTuple):
 
 
 class _Limits(Protocol):
-    """An arm's limits, by joint."""
-
     @property
     def velocity_limits(self) -> tuple[float, ...]: ...
     @property
@@ -217,7 +215,7 @@ class ArmSimulation:
     def command(self, joint_positions: ArrayLike) -> None:
         """Replace the trajectory: move to `joint_positions` [rad] (joints,), all joints arriving together.
 
-        It takes max(0.5 s, the slowest joint's way at its scaled velocity limit) and starts at the current setpoint.
+        It takes max(0.5 s, the slowest joint's travel at its scaled velocity limit) and starts at the current setpoint.
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         way = goal - self.data.act
@@ -312,8 +310,8 @@ class ArmSimulation:
     ) -> Vector:
         """Return joint positions [rad] (joints,) that bring the tool to a position of the base's frame [m] (3,).
 
-        Or near it; with `rotation` (3, 3) the tool's axes too. Damped least squares from `start`, by default from the
-        arm's present posture, so that it is kept; nothing moves.
+        The tool may only come near it; with `rotation` (3, 3) its axes are turned too. Damped least squares from
+        `start`, by default from the arm's present posture, so that it is kept; nothing moves.
         """
         goal = np.asarray(position, dtype=np.float64)
         joints: Vector = np.array(self.joint_positions if start is None else start, dtype=np.float64)

@@ -1,4 +1,4 @@
-"""The domain randomisation wrapper: what it does, in numbers, and that it does nothing unasked."""
+"""The domain randomisation wrapper: its effects in numbers, and none unless requested."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The environments are registered by Gymnasium's own ways, once, in any process."""
+"""Registration of the environments with Gymnasium, once, in any process."""
 
 from __future__ import annotations
 

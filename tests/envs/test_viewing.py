@@ -1,4 +1,4 @@
-"""Views of the environments: shapes and poses, things to take hold of, observations shown again."""
+"""Views of the environments: shapes and poses, things to drag, observations shown again."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""Runs in robo-gym's environment: drives its own classes as a test asks, and writes down what they return.
+"""Runs in robo-gym's environment: drives its own classes on a test's request, and records what they return.
 
     python robo_gym_driver.py <jobs.json> <results.json>
 
-Where a job says "pause", the driver prints a line and waits for one on standard input after that many steps; where it
-says "keep", the next job is another episode in the same environment.
+If a job says "pause", the driver prints a line after that many steps and waits for one on standard input; if it says
+"keep", the next job is another episode in the same environment.
 
 Two of robo-gym 2.0.1's base methods cannot work with any server: `URBaseAvoidanceEnv.reset` calls `super(gym.Env)`,
-which has no reset, and refuses the arguments its subclass passes; its `step` returns five values where the subclasses
+which has no reset, and refuses the arguments its subclass passes; its `step` returns five values, but the subclasses
 unpack four. `mend_avoidance` puts `URBaseEnv.reset` and the four values there. Everything else is as it came from PyPI.
 """
 

@@ -1,4 +1,4 @@
-"""Real time and fast time: the same trajectory, at another pace; and what happens to a client that is late."""
+"""Real time and fast time: the same trajectory at another pace, and late clients."""
 
 from __future__ import annotations
 

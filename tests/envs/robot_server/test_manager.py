@@ -112,7 +112,7 @@ def test_garbage_is_answered_and_the_manager_goes_on(client: Any) -> None:
     for name in ("StartNewServer", "KillServer", "KillAllServers"):
         answer = client.call(name, b"\xff\xff\xff")
         assert not answer.success
-        assert answer.info == "3 bytes that are not such a message"
+        assert answer.info == "3 bytes that are not a valid message"
     assert client.call("VerifyConnection", b"\xff\xff\xff").alive
 
 
@@ -254,7 +254,7 @@ def test_eight_servers_at_once_all_answer_and_all_end(manager: ServerManager, cl
     assert client.kill_all().success
     assert manager.servers.running == {}
     assert not any(is_alive(pid) for pid in running.values())
-    assert client.start(UR).success  # it goes on
+    assert client.start(UR).success  # it continues
 
 
 # -- the command

@@ -1,4 +1,4 @@
-"""Launch lines of robo-gym 2.1, and its environments' own arithmetic on a server's states, beside our environments.
+"""Launch lines of robo-gym 2.1, and its environments' own arithmetic on a server's states, against ours.
 
 robo-gym 2.1 is not on PyPI: what its classes send, and how they make an observation of a state, is written out here.
 """

@@ -292,7 +292,7 @@ def test_garbage_is_answered_with_false_and_the_server_goes_on(
     for garbage in (b"\xff" * 9, b"\x0a\x05\x01", noise, *bad_utf8):
         answer = client.call(name, garbage)
         assert not answer.success
-    assert "bytes that are not such a message" in caplog.text
+    assert "bytes that are not a valid message" in caplog.text
     assert client.state().success
 
 

@@ -1,4 +1,4 @@
-"""Limits of the command stream under hostile commands, without a robot: what is sent is never beyond one."""
+"""Limits of the command stream under hostile commands, without a robot: no setpoint exceeds one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every fault under motion, and how long the arm moves on; `pytest -s` prints it.
+"""Every fault during motion, and the time until the arm stands still; `pytest -s` prints it.
 
 Stopping times are the controller's own: from the cycle of the fault to the one in which the last joint stood.
 """

@@ -75,7 +75,7 @@ class Outlet:
 
 @pytest.fixture(scope="module")
 def scans() -> tuple[Mir100Simulation, dict[str, object]]:
-    """What the simulated base publishes in the room, and the simulation itself."""
+    """Messages of the simulated base in the room, and the simulation itself."""
     outlet = Outlet()
     base = SimulatedBase([outlet], world="lab_6x8", is_stamped=False, faults=LinkFaults())  # type: ignore[list-item]
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""An arm behind ROS 2: the shipped policy through topics, and what stops the arm, by nodes of the real rclpy."""
+"""An arm behind ROS 2: the shipped policy through topics, and what stops the arm, with nodes of the real rclpy."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_policy_reaches_its_targets_through_topics(ros: Ros, sim: Process, node:
     second.wait_for("commanded by")
     assert second.end(0) == 2
     assert "/forward_position_controller/commands" in second.lines[-1]
-    assert ros.heartbeat()["state"] == "arrived"  # the first node goes on
+    assert ros.heartbeat()["state"] == "arrived"  # the first node continues
 
     get_moving(ros, 1.0)
     held = ros.ask("call", service="/rlservo/hold")

@@ -1,4 +1,4 @@
-"""A base behind ROS 2: the shipped policy through topics, and what stops the base, by nodes of the real rclpy."""
+"""A base behind ROS 2: the shipped policy through topics, and what stops the base, with nodes of the real rclpy."""
 
 from __future__ import annotations
 
