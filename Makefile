@@ -74,7 +74,7 @@ python:  # if one was named
 # pip's own output on a terminal; elsewhere only errors.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) .ci/check_python.py $(VENV)
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)  # another one of the same version would mix two
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)  # another Python of the same version would mix two
 	@echo "installing some 200 packages into $(VENV): a few minutes"
 	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt --upgrade pip  # Debian's resolves for ten minutes and more
 	$(BIN)/python -m pip install $(PIP_QUIET) -c constraints.txt -e '.[all,dev,docs]'

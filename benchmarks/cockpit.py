@@ -3,10 +3,10 @@
     python benchmarks/cockpit.py policies [--policy ur5] [--seconds 8] [--window 1280x720 800x600] [--resolution 1 0.5]
 
 `rlservo serve` and `rlservo cockpit --url` run as processes of their own, as users run them, and Chromium without a
-window looks at the page (`pip install playwright`; it draws with the graphics card it finds, or in software, and the
-name of that is printed). For every window and resolution (canvas pixels to a screen's; below 1 is viser's `?fixedDpr=`)
-it prints the frames that the page drew, those that the cockpit published (the page shows them), and how much processor
-time each part took for a frame that was drawn; plots, numbers and layout depend on time, not on frames.
+window looks at the page (`pip install playwright`; it draws with the graphics card, or in software, and the renderer's
+name is printed). For every window and resolution (canvas pixels to a screen's; below 1 is viser's `?fixedDpr=`) it
+prints the frames that the page drew, those that the cockpit published (the page shows them), and each part's processor
+time per drawn frame; plots, numbers and layout depend on time, not on frames.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def wait_for_server(url: str, server: subprocess.Popen[str]) -> None:
 
 
 def cpu_seconds(programs: dict[str, int]) -> dict[str, float]:
-    """Return the processor time so far by what a process is for: `programs` by name, and the browser's parts."""
+    """Return the processor time so far by purpose: `programs` by name, and the browser's parts."""
     spent: defaultdict[str, float] = defaultdict(float)
     for name, pid in programs.items():
         root = psutil.Process(pid)

@@ -3,8 +3,8 @@
     python benchmarks/compiled_policy.py [--rounds 7] [--cc gcc]
 
 The shipped UR5 policy (27-256-256-5) and the LSTM of the MiR100 are exported and compiled. The self-test, built with
--DMEASURE, times 20,000 steps; onnxruntime's session and TorchScript get as long, one after the other in each round. A
-round's figure is a step's median, and the smallest of the rounds counts: other programs only add to it. Ratios are of
+-DMEASURE, times 20,000 steps; onnxruntime's session and TorchScript run for as long, one after the other in each round.
+A round's figure is a step's median, and the smallest of the rounds counts: other programs only add to it. Ratios are of
 two figures of one round; their median counts. Written to bench/compiled_policy.json.
 """
 
@@ -39,7 +39,6 @@ MOST_US = 6.0  # issue 43's target, for the first
 
 
 def median_us(step: Callable[[], Any]) -> float:
-    """Return the median time of a call."""
     taken = []
     for _ in range(STEPS):
         began = time.perf_counter_ns()
@@ -49,7 +48,7 @@ def median_us(step: Callable[[], Any]) -> float:
 
 
 def sides(bundle: Bundle, made: Compiled, compiler: str, folder: Path) -> dict[str, Callable[[], float]]:
-    """Return, by name, what gives the median of a step [µs]."""
+    """Return, by name, functions that measure the median of a step [µs]."""
     prefix = str(made.about["prefix"])
     program = folder / f"{prefix}_measured"
     sources = [made.folder / f"{prefix}_test.c", made.folder / f"{prefix}.c"]

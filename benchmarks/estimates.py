@@ -1,8 +1,8 @@
-"""Coverage of estimates' intervals: repeated recordings, estimated, and counted against the true return.
+"""Coverage of estimates' intervals: how often those from repeated recordings contain the true return.
 
-Each repetition records so many episodes with one policy and estimates the return of others, whose true returns come
-from many episodes of their own. `--world linear` is a point pulled to 0, for fitted Q evaluation alone. Repetition i
-has the seed FIRST_SEED + i: seeds below 1000 were used when the limits of the estimates were chosen.
+Each repetition records episodes with one policy and estimates the return of others, whose true returns come from many
+episodes of their own. `--world linear` is a point pulled to 0, for fitted Q evaluation alone. Repetition i has the seed
+FIRST_SEED + i: seeds below 1000 were used when the limits of the estimates were chosen.
 Run: python benchmarks/estimates.py --importance-only; python benchmarks/estimates.py --world linear --episodes 100
 """
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from rlservo.serve_app.replay.estimate import Estimate, Trajectory, fitted_estimate, importance_sampling
 
-DIRECTION = np.array([0.05, 0.35, 2.2, 1.1])  # of a linear policy that balances
+DIRECTION = np.array([0.05, 0.35, 2.2, 1.1])  # a linear policy that balances
 BEHAVIOUR = 1.0
 TRUTH_EPISODES = 20_000
 LIMIT = 200  # steps of an episode
@@ -26,12 +26,12 @@ FIRST_SEED = 1000
 LINEAR_GAIN, LINEAR_STEPS = 0.5, 10  # of the recorded policy in the linear world
 
 Probability = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Of pushing right, for observations `[rows, 4]`."""
+"""Probability of pushing right, for observations `[rows, 4]`."""
 
 
 @dataclass
 class Candidate:
-    """A policy to estimate, and the count of what was claimed of it."""
+    """A policy to estimate, and the counts of the claims about it."""
 
     name: str
     probability: Probability
@@ -146,7 +146,7 @@ def linear_episodes(
 def linear_study(episodes: int, seeds: range) -> list[Candidate]:
     """Return fitted Q's counts for policies that pull harder or weaker than the recorded one, which explores by noise.
 
-    The candidates differ from the one that the tests have (noise 0.5, pulls harder by 0.2), by which it was tuned.
+    The candidates differ from that of the tests (noise 0.5, pulls harder by 0.2), on which it was tuned.
     """
     found = []
     for noise, shift in [(0.5, 0.2), (0.5, 0.0), (0.5, -0.3), (0.5, 0.5), (0.2, 0.2), (0.2, -0.1)]:
@@ -206,7 +206,7 @@ def main() -> None:
 
 
 def report(candidates: list[Candidate], repetitions: int, episodes: int) -> None:
-    """Print what was claimed of each candidate, and how often it held."""
+    """Print the claims about each candidate, and how often they held."""
     print(f"{repetitions} repetitions of {episodes} episodes; 95% intervals")
     for candidate in candidates:
         print(f"{candidate.name}: true return {candidate.truth:.4g}")

@@ -3,9 +3,9 @@
     python benchmarks/export_policy.py [--rounds 15]
 
 The shipped UR5 checkpoint (27-256-256-6) is exported by the command line in a fresh process: wall time with all
-imports, CPU time and peak memory. Then the bundle acts in this process, `Policy.act` and the session's own `run` (asked
-for the action only, as `act` asks) taking turns; a round's ratio is of times a moment apart, and the median of the
-rounds counts. The ratio of CPU times says more on a machine that others use too. Written to bench/export_policy.json.
+imports, CPU time and peak memory. Then `Policy.act` and the session's own `run` (for the action only, as in `act`)
+alternate in this process; a round's ratio compares times measured a moment apart, and the median of the rounds counts.
+The ratio of CPU times says more on a busy machine. Written to bench/export_policy.json.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def export(out: Path) -> dict[str, float]:
 
 
 def compare(act: Callable[[], Any], bare: Callable[[], Any], calls: int, rounds: int) -> dict[str, float]:
-    """Return microseconds a call of each, and the ratios, taking turns."""
+    """Return the microseconds per call of each, measured alternately, and the ratios."""
     found: dict[str, list[float]] = {"act": [], "bare": [], "act_cpu": [], "bare_cpu": []}
     for number in range(rounds + 1):
         sides = [("act", act), ("bare", bare)]

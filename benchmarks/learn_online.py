@@ -1,4 +1,4 @@
-"""Learning from served robots: eight UR5 arms over HTTP, their policy half trained, with faults on the way.
+"""Learning from served robots: eight UR5 arms over HTTP, their policy half trained, with injected faults.
 
     python examples/train_shipped.py ur5_positioning --set stop.metric=success --set stop.value=0.5   # half trained
     python benchmarks/learn_online.py runs/ur5_positioning/checkpoint --minutes 30
@@ -7,10 +7,10 @@
 Every robot is a process of its own that acts at eight times its control rate, or as fast as the server answers; the
 last one is a ur5e with a real arm's noise. `rlservo serve` records, `rlservo learn` learns. It ends when 95 of the
 robots' last 100 episodes (as they explore) succeed, or when the time is over. Faults: a robot killed, the learner
-killed, the server restarted, episodes that teach nothing (NaN, an end that another key claims, another graph's).
-With `--disturb` all robots are disturbed, and the first and the last version are compared over `--seeds` episodes
-without exploration. Without CHECKPOINT it begins with the shipped ur5_positioning. Figures, log and plot are written to
-bench/learn_online.
+killed, the server restarted, and episodes that must not be learned from (NaN, an end that another key claims, another
+graph's). With `--disturb` all robots are disturbed, and the first and the last version are compared over `--seeds`
+episodes without exploration. Without CHECKPOINT it begins with the shipped ur5_positioning. Figures, log and plot are
+written to bench/learn_online.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def drive(url: str, log: Path, seed: int, model: str, disturbance: str | None, v
                     "success": status == "success",
                 }  # fmt: skip
                 file.write(json.dumps(line) + "\n")
-            except errors.RlservoError as error:  # the server restarts: the arm stands until it is back
+            except errors.RlservoError as error:  # the server restarts: the arm waits until it is back
                 print(f"robot {seed}: {error}", flush=True)
                 time.sleep(1.0)
             seed += ROBOTS
@@ -193,7 +193,7 @@ class Cell:
         return {}
 
     def episodes(self) -> list[dict[str, Any]]:
-        """Return what robots wrote down, in the order of the ends."""
+        """Return the episodes that robots noted, in the order of their ends."""
         lines: list[dict[str, Any]] = []
         for path in self.folder.glob("robot*.jsonl"):
             for text in path.read_text().splitlines():
@@ -203,7 +203,7 @@ class Cell:
 
 
 def poison(cell: Cell) -> None:
-    """Report episodes that must teach nothing, and let another graph's recording appear beside the server's own."""
+    """Report episodes that must not be learned from, and put another graph's recording beside the server's own."""
     newest = cell.state()["versions"][-1]["version"]
 
     def ask(key: str, label: str, **more: Any) -> None:
@@ -217,7 +217,7 @@ def poison(cell: Cell) -> None:
 
     for label, reward, reporter in (("nan", float("nan"), cell.robot_key), ("claimed", 0.0, cell.other_key)):
         ask(cell.robot_key, label, explore=True)
-        ask(cell.robot_key, label, explore=True, reward=reward)  # NaN is no JSON: the request is refused
+        ask(cell.robot_key, label, explore=True, reward=reward)  # NaN is not JSON: the request is refused
         ask(reporter, label, final_status="success", **({} if reward else {"reward": 1e6}))
     rollout = [*RLSERVO, "rollout", ENV.partition(":")[2], "--bundle", cell.path(f"foreign/{NAME}/{newest}")]
     export = [*RLSERVO, "export", str(SHIPPED), "--name", NAME, "--version", newest, "--out", cell.path("foreign")]
@@ -228,7 +228,7 @@ def poison(cell: Cell) -> None:
 
 
 def faults(cell: Cell) -> Iterator[tuple[float, Callable[[], None]]]:
-    """Yield at which share of the time what goes wrong."""
+    """Yield each fault and the share of the time at which it happens."""
 
     def kill_a_robot() -> None:
         cell.end("robot3", signal.SIGKILL)
@@ -253,7 +253,6 @@ def faults(cell: Cell) -> Iterator[tuple[float, Callable[[], None]]]:
 
 
 def run(cell: Cell, with_faults: bool) -> dict[str, Any]:
-    """Return the figures."""
     export = [*RLSERVO, "export", str(cell.checkpoint), "--name", NAME]
     subprocess.run([*export, "--out", cell.path("policies")], check=True, stdout=subprocess.DEVNULL)
     cell.start_server()
@@ -340,7 +339,7 @@ def plot(cell: Cell, result: dict[str, Any]) -> None:
 def whole_checkpoint(folder: Path) -> Path:
     """Return a checkpoint of the shipped policy that can be trained: its weights after an iteration without change.
 
-    The learner goes on with the checkpoint's settings, so the learning rate rises after that iteration.
+    The learner continues with the checkpoint's settings, so the learning rate rises after that iteration.
     """
     settings = yaml.safe_load((SHIPPED / "training.yaml").read_text())
     settings |= {"begin": {"with": SHIPPED.name}, "stop": {**settings["stop"], "env_steps": 1, "episodes": 1}}
@@ -354,7 +353,6 @@ def whole_checkpoint(folder: Path) -> Path:
 
 
 def verdicts(cell: Cell) -> dict[str, str]:
-    """Return the canary's verdict on each version."""
     found = {}
     for path in sorted((cell.folder / "run" / "promotions").glob("*.jsonl"), key=lambda path: int(path.stem)):
         ends = [entry for entry in map(json.loads, path.read_text().splitlines()) if entry["event"] == "end"]
@@ -363,7 +361,7 @@ def verdicts(cell: Cell) -> dict[str, str]:
 
 
 def compare(cell: Cell, seeds: int) -> dict[str, Any]:
-    """Return how the first and the last version do, without exploration, on the same seeds that no robot saw.
+    """Return the results of the first and last version, without exploration, on the same seeds that no robot saw.
 
     With canaries the last version is the last one that was promoted.
     """

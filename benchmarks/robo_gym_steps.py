@@ -2,8 +2,8 @@
 
     python robo_gym_steps.py MANAGER_PORT SECONDS ROUNDS
 
-Prints, last, one JSON line: which protobuf this Python has, and for each robot the steps per second of each round and
-the client's processor time per step.
+The last line it prints is JSON: which protobuf this Python has, and for each robot the steps per second of each round
+and the client's processor time per step.
 """
 
 from __future__ import annotations

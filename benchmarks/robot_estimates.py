@@ -1,8 +1,8 @@
-"""Coverage of estimates' intervals on the UR5: recordings of the shipped policy exploring, candidates near.
+"""Coverage of estimates' intervals on the UR5: recordings of the shipped policy exploring, and candidates near it.
 
 Candidates move the mean of the shipped policy's actions by a part of their spread, or change the spread. Each one's
-true return is measured by driving the simulated arm with it; the estimates have its weights from recorded episodes.
-`--fitted` counts fitted Q evaluation, of candidates that do not explore.
+true return is measured by driving the simulated arm with it; the estimates weight recorded episodes. `--fitted` counts
+fitted Q evaluation, for candidates that do not explore.
 Run (half an hour): rlservo export examples/checkpoints/ur5_positioning --out policies --name ur5 &&
 python benchmarks/robot_estimates.py policies/ur5 && python benchmarks/robot_estimates.py policies/ur5 --fitted
 """
@@ -27,13 +27,13 @@ from rlservo.serve_app.runtime.policy import Policy
 
 ENV = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
 ABREAST = 64  # episodes that run side by side
-VARIANTS = {  # mean moved by so many standard deviations, log of the standard deviation moved by
+VARIANTS = {  # mean moved by so many standard deviations, and the log of the standard deviation by so much
     "the recorded policy": (0.0, 0.0),
     "mean moved by 0.03 of the spread": (0.03, 0.0),
     "spread 2% smaller": (0.0, -0.02),
     "mean moved by 0.3 of the spread": (0.3, 0.0),
 }
-DETERMINISTIC = {  # the spread is e^-20 of what it was
+DETERMINISTIC = {  # with e^-20 of the spread
     "the mode": (0.0, -20.0),
     "the mode moved by 0.3 of the spread": (0.3, -20.0),
     "the mode moved by the spread": (1.0, -20.0),
@@ -46,11 +46,11 @@ class Recorded:
 
     rewards: list[float] = field(default_factory=list)
     weights: list[NDArray[np.float64]] = field(default_factory=list)
-    """At each step, logarithms `[VARIANTS]`."""
+    """Logarithms at each step, `[VARIANTS]`."""
     obs: list[NDArray[np.float32]] = field(default_factory=list)
     actions: list[NDArray[np.float32]] = field(default_factory=list)
     chosen: list[NDArray[np.float32]] = field(default_factory=list)
-    """At each step, actions `[DETERMINISTIC, elements]`."""
+    """Actions at each step, `[DETERMINISTIC, elements]`."""
 
 
 def move(inputs: NDArray[Any], variant: tuple[float, float]) -> NDArray[np.float64]:
@@ -119,7 +119,7 @@ def main() -> None:
             candidate.truth = float(np.mean([sum(one.rewards) for one in driven]))
             print(f"{candidate.name}: true return {candidate.truth:.3f}", flush=True)
         recorded = run_episodes(policy, (0.0, 0.0), arguments.episodes * arguments.repetitions, 0)
-        if not arguments.fitted:  # more episodes than above (one recording is a hundredth of them): the better truth
+        if not arguments.fitted:  # more episodes than above (one recording is a hundredth of them) give a better truth
             candidates[0].truth = float(np.mean([sum(one.rewards) for one in recorded]))
         for repetition in range(arguments.repetitions):
             episodes = recorded[repetition * arguments.episodes :][: arguments.episodes]
@@ -137,7 +137,7 @@ def main() -> None:
 
 
 def trajectory_of(one: Recorded, variant: int, fitted: bool) -> Trajectory:
-    """Return what an estimate is made of."""
+    """Return an estimate's input."""
     weights = None if fitted else np.array(one.weights)[:, variant]
     chosen = np.array(one.chosen)[:, variant if fitted else 0]
     return Trajectory(np.array(one.rewards), weights, np.array(one.obs), np.array(one.actions), chosen)

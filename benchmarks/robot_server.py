@@ -44,8 +44,6 @@ def serialize(message: Any) -> bytes:
 
 
 class Robot:
-    """A connected robot server."""
-
     def __init__(self, port: int, *, is_ur: bool) -> None:
         channel = grpc.insecure_channel(f"127.0.0.1:{port}")
 
@@ -71,7 +69,7 @@ class Robot:
             assert self.set_state(State(state=[0.0] * 3 + [0.0, 2.5, 0.0])).success
 
     def step(self) -> None:
-        """Command and look, as robo-gym's environments do."""
+        """Send a command and read the state, as robo-gym's environments do."""
         self._next = (self._next + 1) % len(self._actions)
         action = Action(action=self._actions[self._next])
         if self._is_ur:
@@ -120,7 +118,6 @@ def speed(line: str, seconds: float, *, is_ur: bool) -> tuple[list[float], list[
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return the CPU time that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -141,7 +138,7 @@ def robo_gym_speed(python: Path, seconds: float) -> dict[str, Any]:
 
 
 def real_time(count: int, seconds: float) -> tuple[float, list[float]]:
-    """Return how long starting `count` servers at once took, and each one's rate on the real clock [Hz]."""
+    """Return how long it took to start `count` servers at once, and each one's rate on the real clock [Hz]."""
     servers = RobotServers(clock="real")
     ports: list[int] = []
     rates: list[float] = []

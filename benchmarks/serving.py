@@ -1,11 +1,11 @@
 """Serving speed compared with other servers: start, memory, latency, throughput, robots at a fixed rate, WebSocket.
 
-    python benchmarks/serving.py --install     # once: the peers' environments; servers that are not installed are left
-    out python benchmarks/serving.py               # six minutes; a second run continues python benchmarks/serving.py
-    --publish     # the same, and writes benchmarks/results/serving.md
+    python benchmarks/serving.py --install     # once: the peers' environments; servers without one are left out
+    python benchmarks/serving.py               # six minutes; a second run continues
+    python benchmarks/serving.py --publish     # the same, and writes benchmarks/results/serving.md
 
-One server runs at a time. Rounds alternate between all servers, and what is compared with bare uvicorn is a ratio
-within one round: a machine's speed drifts by more than servers differ.
+One server runs at a time. Rounds alternate between all servers, and each is compared with bare uvicorn within one
+round: a machine's speed drifts by more than servers differ.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CHECKPOINT = ROOT / "examples" / "checkpoints" / "ur5_positioning_disturbed"
 POLICY = "ur5_positioning_disturbed"
 MINUTES = 6.0
 END_S = 20.0  # [s] for a server to end
-QUIET = 0.5  # load average above which the figures are of a busy machine
+QUIET = 0.5  # load average above which the machine counts as busy
 
 Row = dict[str, Any]
 # Our goals compared with bare uvicorn: at most, or at least, this ratio.
@@ -87,7 +87,7 @@ def measured(name: str, peer: Peer, case: Case, port: int, scale: float) -> Row:
 
 @contextlib.contextmanager
 def started(peer: Peer) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a server in a session of its own, which ends with us, however we end."""
+    """Start a server in a session of its own, which ends when we do."""
     bound = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []
     with tempfile.TemporaryFile() as output:
         server = subprocess.Popen(
@@ -116,13 +116,13 @@ def end(server: subprocess.Popen[bytes]) -> None:
     for pid in family[::-1]:
         with contextlib.suppress(psutil.Error):
             process = psutil.Process(pid)
-            if process.ppid() in (1, server.pid, os.getpid()):  # not another one that has got the number since
+            if process.ppid() in (1, server.pid, os.getpid()):  # not another process that has reused the number
                 process.kill()
     server.wait()
 
 
 def wait_for_answer(server: subprocess.Popen[bytes], peer: Peer, case: Case, port: int) -> float:
-    """Return the seconds until the policy's action came. Raises RuntimeError."""
+    """Return the seconds until the policy's action arrived. Raises RuntimeError."""
     began = time.perf_counter()
     request = peer.request(case, port)
     head, _, body = request.partition(b"\r\n\r\n")
@@ -156,7 +156,6 @@ def check(answer: bytes, peer: Peer, case: Case) -> None:
 
 
 def under(plan: Plan) -> dict[str, float]:
-    """Return what the load generator measured."""
     command = [sys.executable, str(LOAD), json.dumps(asdict(plan))]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60 + 4 * plan.seconds)
     if done.returncode != 0:
@@ -168,7 +167,7 @@ def under(plan: Plan) -> dict[str, float]:
 
 
 def memory_mb(pid: int) -> tuple[float, float]:
-    """Return resident memory of a process and all below it, and the same with what they share divided among them."""
+    """Return resident memory of a process and its children, and the same with shared memory divided among them."""
     family = [psutil.Process(pid), *psutil.Process(pid).children(recursive=True)]
     found = []
     for process in family:

@@ -28,8 +28,6 @@ WARM_UP_S = 0.3
 
 @dataclass(frozen=True)
 class Plan:
-    """One measurement."""
-
     port: int
     request: str  # base64: a whole HTTP request, or for a WebSocket one message
     seconds: float
@@ -54,7 +52,7 @@ class Result:
 
 @dataclass
 class Times:
-    """Durations of what was asked after the warm-up [s]."""
+    """Durations of the requests after the warm-up [s]."""
 
     starts_at: float
     ends_at: float
@@ -87,13 +85,13 @@ def end_of_reply(data: bytes | bytearray) -> int:
 
 
 class Robot(asyncio.Protocol):
-    """A connection that asks at its rate, or as soon as it is answered."""
+    """A connection that sends requests at its rate, or as soon as it is answered."""
 
     def __init__(self, request: bytes, times: Times, period_s: float, offset_s: float) -> None:
         self._request, self._times, self._period_s = request, times, period_s
         self._offset_s = offset_s
         self._buffer = bytearray()
-        self._began = 0.0  # 0: nothing is asked
+        self._began = 0.0  # 0: no request is pending
         self._timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -151,7 +149,7 @@ async def ask_by_robots(plan: Plan, request: bytes, times: Times) -> None:
 
 
 def ask_one_by_one(plan: Plan, request: bytes, times: Times) -> None:
-    """Run one connection without an event loop, whose turns would count."""
+    """Run one connection without an event loop, whose overhead would count."""
     with connect(plan.port) as connection:
         while (began := time.perf_counter()) < times.ends_at:
             connection.sendall(request)
@@ -163,7 +161,6 @@ def ask_one_by_one(plan: Plan, request: bytes, times: Times) -> None:
 
 
 def stream(plan: Plan, message: bytes, times: Times) -> None:
-    """Send the message as a WebSocket's binary frame again and again."""
     key, mask = base64.b64encode(os.urandom(16)).decode(), os.urandom(4)
     repeated = np.frombuffer((mask * (len(message) // 4 + 1))[: len(message)], np.uint8)
     payload = (np.frombuffer(message, np.uint8) ^ repeated).tobytes()
@@ -189,7 +186,7 @@ def stream(plan: Plan, message: bytes, times: Times) -> None:
 
 
 def next_frame(connection: socket.socket, data: bytes) -> bytes:
-    """Read one binary frame; return what came behind it."""
+    """Read one binary frame; return the bytes after it."""
     while len(data) < 4:
         data += receive(connection)
     if data[0] != 0x82:
@@ -216,7 +213,6 @@ def receive(connection: socket.socket) -> bytes:
 
 
 def measure(plan: Plan) -> Result:
-    """Carry out one measurement."""
     begin = time.perf_counter() + WARM_UP_S
     times, content = Times(begin, begin + plan.seconds), base64.b64decode(plan.request)
     with contextlib.suppress(OSError):  # replies until then count, and the failure

@@ -1,4 +1,4 @@
-"""Servers that `serving.py` compares: how each is started and asked, and the environments of those that are not ours.
+"""Servers that `serving.py` compares: their commands and requests, and the environments of those that are not ours.
 
 An environment is made by `serving.py --install` from complete, pinned lists (`peers/requirements/`) and kept in the
 user's cache; a peer without one is left out.
@@ -68,7 +68,7 @@ class Peer:
     checks: bool = True  # whether it answers with the policy's action
 
     def request(self, case: Case, port: int) -> bytes:
-        """Return the HTTP request of one observation, as a robot's client sends it: float32s in their digits."""
+        """Return the HTTP request of one observation, as a robot's client sends it: float32 numbers in full."""
         obs = [float(str(value)) for value in case.obs]
         document: object = {self.key: obs}
         if self.path.endswith("/infer"):
@@ -143,7 +143,7 @@ def _bentoml(case: Case, port: int, folder: Path) -> Peer:
 def _on_ray(script: str, what: Path | str, port: int, folder: Path, **options: object) -> Peer:
     # A token of its own: a local ray.init() would write one into the user's home and keep using it.
     own = {"RAY_TMPDIR": str(folder), "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
-    own["RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S"] = "60"  # after 5 Serve kills a proxy that is not ready yet
+    own["RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S"] = "60"  # after 5 s Serve kills a proxy that is not ready yet
     own |= {} if options.pop("is_plain", False) else SWITCHES
     command = [sys.executable, str(PEERS / script), str(port), str(what)]
     return Peer(command, environment=own, starts_in_s=120, **options)  # type: ignore[arg-type]
@@ -197,7 +197,7 @@ def python_of(name: str) -> str:
 
 
 def install() -> None:
-    """Make the environments that are not there; one that cannot be made is named."""
+    """Make the missing environments; one that cannot be made is named."""
     pip = [sys.executable, "-m", "pip"]
     for name in sorted(path.stem for path in (PEERS / "requirements").glob("*.txt")):
         folder = _place(name)

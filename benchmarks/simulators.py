@@ -2,8 +2,8 @@
 
     python benchmarks/simulators.py [--seconds 3]
 
-Steps per second of wall clock, and per second of this process's CPU time, which says the same on a machine that others
-use too. Medians of five rounds, the environments taking turns; written to bench/simulators.json as well.
+Steps per second of wall clock, and per second of this process's CPU time, which stays comparable on a busy machine.
+Medians of five rounds, the environments alternating; written to bench/simulators.json as well.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""Train a policy that ships with other settings, and compare what comes of them.
+"""Train a shipped policy with other settings, and compare the results.
 
     python benchmarks/sweep.py mir100_obstacle_avoidance               # all its variants, hours on two cores
     python benchmarks/sweep.py ur5_positioning --set stop.env_steps=310000 --seeds 2
     python benchmarks/sweep.py mir100_obstacle_avoidance --variants "as it ships" "three frames"
 
 `benchmarks/variants/NAME.yaml` has the variants: what each changes of `examples/checkpoints/NAME/training.yaml`. Each
-is trained by `train_shipped.py`, a process for each core, and what it comes to is exported and judged as the cards are,
-without exploration, on seeds of its own (`--first-seed`). The table goes to `bench/sweep-NAME.md`, a line as soon as
-its training has ended; checkpoints, curves and logs to `bench/sweep-NAME/`.
+is trained by `train_shipped.py`, one process per core, and the result is exported and judged as in the cards, without
+exploration, on its own seeds (`--first-seed`). The table goes to `bench/sweep-NAME.md`, a line per training as soon as
+it has ended; checkpoints, curves and logs to `bench/sweep-NAME/`.
 """
 
 from __future__ import annotations
@@ -41,8 +41,6 @@ HEAD = "| variant | seed | steps | CPU s | {starts} | over all | 95% interval |"
 
 @dataclass(frozen=True)
 class Trial:
-    """One training of the sweep."""
-
     variant: str
     seed: int
     settings: dict[str, Any]
@@ -69,7 +67,7 @@ class Trial:
         return f"{self.variant}, seed {self.seed}: {' '.join(last.split())}"
 
     def judge(self, name: str, episodes: int, first_seed: int) -> list[evaluate_shipped.Evaluation]:
-        """Export what was trained, and let it act."""
+        """Export the result of a training, and let it act."""
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = self.folder / name / "checkpoint"
             bundle = rlservo.export_checkpoint(checkpoint, folder, name="trial", notify=lambda _: None)
@@ -80,7 +78,7 @@ class Trial:
 def variants_of(name: str, wanted: list[str]) -> dict[str, dict[str, Any]]:
     """Return a policy's settings by the variants' names, changed as their file says; "" unchanged for none.
 
-    Raises ValueError for a name that is not there.
+    Raises ValueError for a name that does not exist.
     """
     path = VARIANTS / f"{name}.yaml"
     every: dict[str, dict[str, Any]] = yaml.safe_load(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -98,7 +96,6 @@ def variants_of(name: str, wanted: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def line_of(trial: Trial, curve: str, evaluations: list[evaluate_shipped.Evaluation]) -> str:
-    """Return a trial's line of the table."""
     steps, *_, cpu_s = curve.split(",")
     successes, episodes = (sum(getattr(one, what) or 0 for one in evaluations) for what in ("successes", "episodes"))
     low, high = wilson_interval(successes, episodes)

@@ -6,11 +6,12 @@
     python benchmarks/time_to_success.py --variants quick         # with settings of variants/ur5_positioning.yaml
 
 Task and settings are those of a policy that ships (`examples/checkpoints/NAME/training.yaml`), or variants of them;
-RLlib samples with one process a core. Stable-Baselines3 (`pip install stable-baselines3`) gets the same environment,
+RLlib samples with one process per core. Stable-Baselines3 (`pip install stable-baselines3`) gets the same environment,
 network, batches, rates and weight of the value's loss, its own VecNormalize, torch's threads, and all environments in
-one process or one each; RLlib's KL term and bound of the value's loss it does not have, and its first weights and one
-standard deviation are always those of `quick`. Success is that of training, with exploration; RLlib's last episodes are
-whole iterations', so some more than 100. Table and plot are written to `bench/time_to_success.json` and `.png`.
+one process or one each; it lacks RLlib's KL term and bound of the value's loss, and its first weights and single
+standard deviation are always those of `quick`. Success is measured in training, with exploration; RLlib's last episodes
+are those of whole iterations, so slightly more than 100. Table and plot are written to `bench/time_to_success.json` and
+`.png`.
 """
 
 # pyright: reportMissingImports=false
@@ -63,7 +64,6 @@ Points = Generator[tuple[int, float, float], None, None]
 
 
 def rllib(settings: dict[str, Any], seed: int) -> Points:
-    """Train with RLlib."""
     config = train_shipped.algorithm_config(settings, seed)
     runners = sampling_processes(settings["envs"])
     config.env_runners(num_env_runners=runners, num_envs_per_env_runner=settings["envs"] // runners)
@@ -74,12 +74,11 @@ def rllib(settings: dict[str, Any], seed: int) -> Points:
 
 
 def sampling_processes(envs: int) -> int:
-    """Return how many sample: one a core, since sampling and learning take turns, with as many environments each."""
+    """Return the number of sampling processes: at most one per core, each with as many environments."""
     return max(count for count in range(1, (os.cpu_count() or 1) + 1) if envs % count == 0)
 
 
 def stable_baselines(settings: dict[str, Any], seed: int, *, processes: bool) -> Points:
-    """Train with Stable-Baselines3's PPO."""
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
     from training_inference_ur_sb3 import make_env, make_ppo, rate_after
 

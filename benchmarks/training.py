@@ -1,4 +1,4 @@
-"""Measure training speed by env runners x environments each, and where its time goes.
+"""Measure training speed and its parts, by number of env runners and environments in each.
 
     python benchmarks/training.py            # 1 and 2 runners, 1, 4 and 16 environments, UR5; ten minutes or so
     python benchmarks/training.py --quick    # the same with small batches, at most 3 minutes
@@ -6,7 +6,7 @@
 
 PPO as the UR5 script trains it: a batch of `--batch` steps, 4 epochs. A row is the median of `--iterations` iterations
 after one of warm-up. `--minutes` are divided among the configurations: one whose time is up keeps the iterations it has
-finished, or is written down as failed, and the next one is measured. Table and plot (`bench/training.json`, `.png`) are
+finished, or is recorded as failed, and the next one is measured. Table and plot (`bench/training.json`, `.png`) are
 written after each row. `vectorisation.py` compares ways to step several simulators in one process.
 """
 
@@ -39,10 +39,10 @@ MINIBATCH = 512
 
 @dataclass(frozen=True)
 class Iteration:
-    """The shares are of a runner's own time, by RLlib's timers, which are smoothed."""
+    """One iteration. Shares refer to a runner's own time, by RLlib's timers, which are smoothed."""
 
     steps_per_s: float
-    steps_per_cpu_s: float  # of the driver's and the runners' processor time, which a busy machine leaves comparable
+    steps_per_cpu_s: float  # of the driver's and the runners' processor time, which stays comparable on a busy machine
     iteration_s: float
     sample_s: float  # waiting for the runners
     learn_s: float
@@ -54,7 +54,7 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Row:
-    """A configuration's medians over so many iterations."""
+    """A configuration's medians over its iterations."""
 
     runners: int
     envs: int
@@ -80,7 +80,7 @@ class Failed:
 
 
 class TimeUp(Exception):
-    """A configuration took longer than it may."""
+    """A configuration exceeded its time."""
 
 
 def main() -> None:
@@ -127,7 +127,7 @@ def warm_up() -> None:
 
 
 class TimeLimit:
-    """Raises TimeUp in the block when the time is up: Ray's calls look for signals while they wait."""
+    """Raises TimeUp in the block when the time is up: Ray's calls handle signals while they wait."""
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
@@ -223,7 +223,6 @@ class Clock:
         return timed
 
     def iteration(self) -> Iteration:
-        """Train once and return the figures."""
         cpu, steps = cpu_seconds(self._algorithm), self._steps
         self._seconds = {"sample": 0.0, "learn": 0.0}
         began = time.perf_counter()

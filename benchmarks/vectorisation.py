@@ -4,14 +4,14 @@
     python benchmarks/vectorisation.py --quick    # about 30 s
 
 Whole environments (random actions, resets included): Gymnasium's SyncVectorEnv, which is RLlib's default; its
-AsyncVectorEnv, a process each; a bare Python loop; and the loop's environments divided among threads (MuJoCo gives the
-interpreter free in `mj_step`). Physics alone, the same substeps without observations, rewards and resets: an upper
-bound for whatever would batch it. Substep by substep as our simulators do, a cycle in one call, that in threads, and
+AsyncVectorEnv, a process each; a bare Python loop; and the loop's environments divided among threads (MuJoCo releases
+the interpreter's lock in `mj_step`). Physics alone, the same substeps without observations, rewards and resets, is an
+upper bound for any batching: substep by substep as our simulators do, a cycle in one call, the same in threads, and
 `mujoco.rollout`.
 
-The ways take turns in each round, and each is compared with SyncVectorEnv of the same round: medians, of wall clock and
-of this process's CPU time, which a machine that others use too leaves comparable (but says nothing of what two cores
-gain, nor of AsyncVectorEnv). Written to `bench/vectorisation.json` and `.png` as it goes.
+The methods alternate in each round, and each is compared with SyncVectorEnv in the same round: medians of wall clock
+and of this process's CPU time, which stays comparable on a busy machine (but does not show the gain of two cores, nor
+AsyncVectorEnv). Written to `bench/vectorisation.json` and `.png` as it goes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ UR5 = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
 SYNC, ASYNC = "SyncVectorEnv", "AsyncVectorEnv, a process each"
 THREADS = min(4, os.cpu_count() or 1)
 Way = Callable[[], None]  # one step of all robots
-Rates = dict[str, dict[int, list[tuple[float, float]]]]  # by way and robots, of each round: steps/s, steps per CPU s
+Rates = dict[str, dict[int, list[tuple[float, float]]]]  # by method and robots, per round: steps/s, steps per CPU s
 WALL, CPU = 0, 1
 
 
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def measure(robots: Sequence[int], rounds: int, seconds: float, *, out: Path) -> Rates:
-    """Measure every way with each number of robots, print the table, write JSON and plot after each number."""
+    """Measure every method with each number of robots, print the table, write JSON and plot after each number."""
     out.mkdir(parents=True, exist_ok=True)
     rates: Rates = {}
     print(
@@ -97,13 +97,12 @@ def median(rates: Rates, name: str, robots: int) -> float:
 
 
 def ratio(rates: Rates, name: str, robots: int, clock: int) -> float:
-    """Return the median over the rounds of a way's speed over SyncVectorEnv's."""
+    """Return the median over the rounds of a method's speed relative to SyncVectorEnv's."""
     pairs = zip(rates[name][robots], rates[SYNC][robots], strict=True)
     return statistics.median(own[clock] / sync[clock] for own, sync in pairs)
 
 
 def ways_of(robots: int) -> dict[str, contextlib.AbstractContextManager[Way]]:
-    """Return what is compared, by its name in the table."""
     return {
         SYNC: vector_env(SyncVectorEnv, robots),
         ASYNC: vector_env(AsyncVectorEnv, robots),
@@ -159,7 +158,7 @@ def environments(robots: int, *, threads: int) -> Iterator[Way]:
 
 @contextlib.contextmanager
 def divided(items: Sequence[Any], threads: int) -> Iterator[Callable[[Callable[[Any], None]], None]]:
-    """Give a function that applies another to every item: in a loop, or in as many loops as there are threads."""
+    """Give a function that applies another to every item: in a loop, or in one loop per thread."""
 
     def loop(chunk: Sequence[Any], work: Callable[[Any], None]) -> None:
         for item in chunk:

@@ -1,4 +1,4 @@
-"""Measure the policies in examples/checkpoints as their cards state it: exported, deterministic, on fresh seeds.
+"""Measure the policies in examples/checkpoints as their cards state: exported, deterministic, on fresh seeds.
 
     python examples/evaluate_shipped.py                          # all of them, 500 episodes each
     python examples/evaluate_shipped.py cartpole_dqn --write     # and put the figures into its card
@@ -50,12 +50,10 @@ class Evaluation:
 
 
 def shipped_names() -> list[str]:
-    """Return the names of the policies that ship."""
     return sorted(path.parent.name for path in SHIPPED.glob("*/training.yaml"))
 
 
 def load_settings(name: str) -> dict[str, Any]:
-    """Return the contents of a policy's training.yaml."""
     settings: dict[str, Any] = yaml.safe_load((SHIPPED / name / "training.yaml").read_text(encoding="utf-8"))
     return settings
 

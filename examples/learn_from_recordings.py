@@ -5,8 +5,8 @@
 Recordings (`rlservo rollout --record`, `WithRecording`, clients) become RLlib's episodes: actions as the module gave
 them, before unsquash and clip; observations through the checkpoint's own connectors, filters as they stand. BC, MARWIL,
 CQL and IQL learn from whole episodes, starting at the checkpoint's weights if the algorithm has such a network. The
-result is a checkpoint that `rlservo export` takes. Without `--from` the network is new, and so is its observation
-filter: of the recorded observations. docs/how-to/learn.md has the whole path.
+result is a checkpoint that `rlservo export` takes. Without `--from` the network is new, and its observation filter is
+computed from the recorded observations. docs/how-to/learn.md has the whole path.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def module_spec(config: AlgorithmConfig, start: Start, longest: int) -> tuple[RL
     actor_critic = type(config).__name__ in ("BCConfig", "MARWILConfig")
     fits = isinstance(module, ValueFunctionAPI) if actor_critic else isinstance(module, DefaultSACRLModule)
     if not fits:
-        return None, f"a new network: {type(module).__name__} is none of this algorithm's"
+        return None, f"a new network: {type(module).__name__} does not belong to this algorithm"
     spec = RLModuleSpec.from_module(module)
     spec.inference_only = False
     settings = (
@@ -173,7 +173,7 @@ def module_spec(config: AlgorithmConfig, start: Start, longest: int) -> tuple[RL
 
 
 def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmConfig, Start, str]:
-    """Return RLlib's configuration, what is learned on, and a sentence about the network."""
+    """Return RLlib's configuration, the start, and a sentence about the network."""
     config = training_run.default_config(args.run)
     config.learners(num_learners=0, num_gpus_per_learner=0)
     config.env_runners(num_env_runners=0)
@@ -189,8 +189,8 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
         cast(Any, config).lr = None
         private_names.replace(config, "_is_online", False)
     if args.run == "MARWIL":
-        # RLlib's 100 never changes at its rate of 1e-8: advantages of a hundredth are then no advantages, and those of
-        # a thousand overflow. The variance of returns is their scale until the value function has learned.
+        # RLlib's 100 never changes at its rate of 1e-8: advantages of a hundredth then vanish, and those of a thousand
+        # overflow. The variance of returns is their scale until the value function has learned.
         returns = [episode.get_return() for episode in recorded.episodes]
         cast(Any, config).training(
             moving_average_sqd_adv_norm_start=float(np.var(returns)) or 1.0,
@@ -202,14 +202,14 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
         else start_anew(config, recorded, args.observation_filter == "MeanStdFilter")
     )
     action_space = start.module_to_env.input_action_space or gym_space(recorded.contract.action_space)
-    origin = recorded.contract.provenance  # nothing is made of the environment: an export names its elements by it
+    origin = recorded.contract.provenance  # no environment is made: an export names its elements by it
     config.environment(
         env=origin.env_id,
         env_config=dict(origin.env_config),
         observation_space=start.env_to_module.observation_space,
         action_space=action_space,
     )
-    longest = max(map(len, recorded.episodes)) + 1  # RLlib puts a step behind each, for the value of what follows
+    longest = max(map(len, recorded.episodes)) + 1  # RLlib appends a step to each, for the value of what follows
     spec, sentence = module_spec(config, start, longest)
     if spec is not None:
         config.rl_module(rl_module_spec=spec)
@@ -238,14 +238,14 @@ def learn(config: AlgorithmConfig, episodes: list[SingleAgentEpisode], epochs: i
             losses = "  ".join(f"{name} {float(results[name]):.6g}" for name in sorted(results) if "loss" in name)
             print(f"pass {epoch + 1:>3} of {epochs}  {losses}", flush=True)
         algorithm.save_to_path(str(folder.resolve()))
-    # An offline algorithm has no environment runner, and so none of what stands around its module.
+    # An offline algorithm has no environment runner, and so no connectors around its module.
     runner = folder.resolve() / TRAINING_RUNNER
     for pipeline, name in ((start.env_to_module, ENV_TO_MODULE), (start.module_to_env, MODULE_TO_ENV)):
         pipeline.save_to_path(str(runner / name), state=pipeline.get_state())  # else it misses pieces without a state
 
 
 def report(recorded: Recorded) -> None:
-    """Print what the recordings hold for a learner."""
+    """Print what a learner can use of the recordings."""
     print(
         f"{len(recorded.episodes)} episodes, {recorded.decisions} decisions of {recorded.contract.name}, "
         f"mean return {recorded.mean_return:.4g}"

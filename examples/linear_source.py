@@ -18,7 +18,7 @@ from rlservo.export.sources.torch_policy import Act, TorchPolicy, restored
 class Linear(Source):
     name = "linear"
     framework = "numpy"
-    distribution = "numpy"  # whose version goes into the contract
+    distribution = "numpy"  # its version goes into the contract
     extra = "train"
     expects = "a file NAME.linear.npy"
     reference = "the matrix product in numpy, clipped to [-1, 1]"

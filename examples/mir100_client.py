@@ -1,4 +1,4 @@
-"""The bare loop: a MiR100 simulator driven by a policy that is served somewhere.
+"""The bare loop: a MiR100 simulator driven by a served policy.
 
     rlservo export examples/checkpoints/mir100_navigation --out policies --name mir100
     rlservo serve policies

@@ -5,8 +5,8 @@
     python examples/robo_gym_client.py    # a third, in robo-gym's environment
     python examples/robo_gym_client.py --task ObstacleAvoidanceMir100 --policy mir100_obstacle_avoidance
 
-robo-gym pins an old protobuf, so it cannot share an environment with Ray: docs/how-to/robo-gym.md says how to make its
-own, and what must be done before `--rs-address` drives a real robot.
+robo-gym pins an old protobuf, so it cannot share an environment with Ray: docs/how-to/robo-gym.md shows how to make its
+own, and what to do before `--rs-address` drives a real robot.
 
 Standard output has the report only: robo-gym's own output goes to standard error. Exit codes: 0, 1 for a failure, 2
 for a wrong argument, 130 for Ctrl-C, after which no simulator is left.
@@ -43,7 +43,7 @@ MANAGER_PORTS = range(50100, 50200)  # robo-gym looks for a server manager here
 ANSWER_S = 5.0  # [s] to connect, and again to answer; robo-gym itself waits 20 s for each of a hundred ports
 VERIFY = "/robo_gym_server_manager.grpc_msgs.server_manager.ServerManager/VerifyConnection"
 GET_STATE = "/robot_server.RobotServer/GetState"
-NOT_BY_PROXY = "no_grpc_proxy"  # gRPC's variable, which goes before `no_proxy`
+NOT_BY_PROXY = "no_grpc_proxy"  # gRPC's variable, which takes precedence over `no_proxy`
 INTERRUPTED = 130  # the shell's exit code for Ctrl-C
 
 
@@ -58,7 +58,7 @@ def main() -> int:
             is_interrupted = False
             try:
                 with PolicyClient(args.url, args.policy or POLICIES[args.task]) as policy:
-                    _ = policy.contract  # before a simulator is started for a policy that is not there
+                    _ = policy.contract  # before a simulator is started for a policy that does not exist
                     drive(env_id, arguments, policy, args.episodes, endings, seconds, None if args.json else out)
             except KeyboardInterrupt:
                 is_interrupted = True
@@ -83,10 +83,10 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--policy", help="its name on the server (default: ur5, mir100 or mir100_obstacle_avoidance, by the task)"
     )
-    parser.add_argument("--ur-model", choices=UR_MODELS, help="of a UR task (default: ur5)")
+    parser.add_argument("--ur-model", choices=UR_MODELS, help="arm of a UR task (default: ur5)")
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--manager", default="127.0.0.1", help="where rlservo server-manager runs")
-    parser.add_argument("--manager-port", type=int, help="its port; without it 50100 to 50199 are searched")
+    parser.add_argument("--manager-port", type=int, help="the manager's port; 50100 to 50199 are searched by default")
     parser.add_argument("--rs-address", help="host:port of a running robot server, instead of a manager")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
     args = parser.parse_args()
@@ -234,7 +234,7 @@ def hold_interrupts() -> Iterator[None]:
 
 @contextlib.contextmanager
 def sentences(what: str) -> Iterator[None]:
-    """Turn whatever robo-gym raises into one sentence. The wire has no room for reasons: the server's log has them."""
+    """Turn whatever robo-gym raises into one sentence. Its protocol carries no reasons: the server's log has them."""
     try:
         yield
     except grpc.RpcError as error:

@@ -73,7 +73,7 @@ AFTER_RESUME = ("resume", "address")  # allowed with --resume; everything else i
 
 
 def argument_parser() -> argparse.ArgumentParser:
-    """Return the parser; its groups are what a person looks for together."""
+    """Return the parser, its arguments grouped by purpose."""
     parser = argparse.ArgumentParser(
         description="Train any RLlib algorithm on any Gymnasium environment and export a policy bundle.",
         usage="%(prog)s [--run PPO] [--name-env CartPole-v1] [--num-cpus N] ...  (--help lists all)",
@@ -92,7 +92,7 @@ def argument_parser() -> argparse.ArgumentParser:
         "--observation-filter", choices=["NoFilter", "MeanStdFilter"], default="NoFilter", help="normalise observations"
     )
     what.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="any setting of the algorithm")
-    what.add_argument("--seed", type=int, default=0, help="of training; episodes afterwards use 10000 and up")
+    what.add_argument("--seed", type=int, default=0, help="seed of training; later episodes use 10000 and up")
 
     where = parser.add_argument_group("on what")
     where.add_argument(
@@ -102,8 +102,8 @@ def argument_parser() -> argparse.ArgumentParser:
     where.add_argument("--num-envs-per-env-runner", type=int, default=1, help="environments in each env runner")
     where.add_argument("--num-learners", type=int, default=0, help="learner processes; 0 learns in the driver")
     where.add_argument("--num-gpus-per-learner", type=float, help="instead of --num-gpus")
-    where.add_argument("--num-gpus-per-env-runner", type=float, default=0.0, help="for networks slow to run")
-    where.add_argument("--address", help="of a running Ray cluster ('auto' finds it); default: a private one")
+    where.add_argument("--num-gpus-per-env-runner", type=float, default=0.0, help="GPUs of each, for slow networks")
+    where.add_argument("--address", help="address of a Ray cluster ('auto' finds it); default: a private one")
 
     until = parser.add_argument_group("until when")
     until.add_argument("--stop-iters", type=int, default=200, help="training iterations at most")
@@ -156,7 +156,7 @@ def argument_parser() -> argparse.ArgumentParser:
 
 class _NewName(argparse.Action):
     def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-        parser.error(f"{option_string} is of older versions: use {OLD_ARGUMENTS[str(option_string)]}")
+        parser.error(f"{option_string} is obsolete: use {OLD_ARGUMENTS[str(option_string)]}")
 
 
 def check_arguments(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
@@ -214,7 +214,6 @@ def cores_needed(args: argparse.Namespace) -> int:
 
 
 def gpus_needed(args: argparse.Namespace) -> float:
-    """Return the GPUs of one trial."""
     per_learner = gpus_per_learner(args)
     return float(per_learner * max(1, args.num_learners) + args.num_gpus_per_env_runner * args.num_cpus)
 
@@ -229,7 +228,7 @@ def gpus_per_learner(args: argparse.Namespace) -> float:
 def check_machine(run: Run, config: AlgorithmConfig | None = None, concurrent: int | None = None) -> None:
     """Raise UsageError if this machine has too little for the run, before Ray starts.
 
-    The driver may share the last core. That is also what a Ray of our own is started with.
+    The driver may share the last core. A Ray of our own is started with as many.
     """
     gpus = training_run.local_gpus() if run.num_gpus else 0.0
     first, *others = run.request
@@ -242,7 +241,7 @@ def check_machine(run: Run, config: AlgorithmConfig | None = None, concurrent: i
 
 
 def ray_cores(run: Run) -> int:
-    """Return the cores a private Ray is started with: of as many trials at once as the machine holds."""
+    """Return the cores for a private Ray: for as many trials at once as the machine holds."""
     return run.num_cpus * max(1, (os.cpu_count() or 1) // run.num_cpus)
 
 
@@ -335,7 +334,7 @@ def _is_known_image(space: Box) -> bool:
 
 
 def inspect_environment(args: argparse.Namespace, env_config: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return the environment's spaces, after a look at whether the algorithm can act in it.
+    """Return the environment's spaces, after checking that the algorithm can act in it.
 
     Raises UsageError for an environment that cannot be made and for actions that do not fit.
     """
@@ -401,7 +400,7 @@ def set_up(args: argparse.Namespace) -> tuple[AlgorithmConfig, Run, list[str]]:
 
 
 def scheduler(args: argparse.Namespace) -> Any:
-    """Return Tune's scheduler: all to the end, or those far behind the others stopped early."""
+    """Return Tune's scheduler: either every trial runs to the end, or those far behind are stopped early."""
     if args.scheduler == "asha":
         return ASHAScheduler(
             time_attr="training_iteration", max_t=args.stop_iters, grace_period=max(1, min(5, args.stop_iters // 4))
@@ -431,7 +430,7 @@ def main() -> None:
         if more := sorted(explicit(sys.argv[1:]) - set(AFTER_RESUME)):
             raise errors.UsageError(f"--resume uses the run's own settings: leave --{more[0].replace('_', '-')} out")
         run, _ = training_run.load_run(args.resume)
-        if args.address is None and run.request:  # runs of before have none
+        if args.address is None and run.request:  # older runs have none
             check_machine(run)
         with training_run.ray_session(
             num_cpus=ray_cores(run),

@@ -1,7 +1,7 @@
 """A recurrent agent of skrl as a module for `rlservo.export_policy`.
 
-skrl's Runner makes no recurrent models, so that no file of a run says which a checkpoint is of: make the agent as your
-training does, load the checkpoint (`agent.load`), and export
+skrl's Runner makes no recurrent models, so no file of a run describes the network: make the agent as your training
+does, load the checkpoint (`agent.load`), and export
 
     policy = RecurrentPolicy(agent)
     rlservo.export_policy(policy, observations, actions, "policies", name="arm", state=policy.initial_state())
@@ -19,7 +19,7 @@ from torch import Tensor
 
 
 class RecurrentPolicy(torch.nn.Module):
-    """The mean action of an agent's policy: its preprocessor, its model, and the memory that the model says it has."""
+    """The mean action of an agent's policy: its preprocessor, its model, and the memory that the model declares."""
 
     def __init__(self, agent: Any) -> None:
         super().__init__()
@@ -32,7 +32,7 @@ class RecurrentPolicy(torch.nn.Module):
         return {f"h{number}": np.zeros((size[0], size[2]), np.float32) for number, size in enumerate(self.sizes)}
 
     def forward(self, obs: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Return the action and the next memory, of observations (batch, n) and memory (batch, layers, cells)."""
+        """Return the action and the next memory, given observations (batch, n) and memory (batch, layers, cells)."""
         seen = obs if self.preprocessor is None else self.preprocessor(obs)
         memory = [part.transpose(0, 1).contiguous() for part in state]
         mean, outputs = self.model.compute({"observations": seen, "states": None, "rnn": memory}, role="policy")

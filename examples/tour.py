@@ -1,4 +1,4 @@
-"""The tour: everything RLlib's getting-started guide and its introduction notebook do, on today's Ray, as one script.
+"""The tour: everything in RLlib's getting-started guide and introduction notebook, on today's Ray, as one script.
 
     python examples/tour.py             # CartPole (PPO), FrozenLake (DQN) and the UR5 (the policy that ships)
     python examples/tour.py cartpole --quick
@@ -84,7 +84,7 @@ def look_at(env_id: str, **arguments: Any) -> None:
         f"success from a mean return of {spec.reward_threshold}, episodes of at most {spec.max_episode_steps} steps, "
         f"arguments {spec.kwargs}"
     )
-    check_env(env.unwrapped, skip_render_check=True)  # raises on what it does not like
+    check_env(env.unwrapped, skip_render_check=True)  # raises if it finds a fault
     print("the environment check passed")
     env.close()
 
@@ -107,7 +107,6 @@ def random_baseline(env_id: str, episodes: int, **arguments: Any) -> float:
 
 
 def film(settings: Settings, bundle: Path, env_id: str, **arguments: Any) -> None:
-    """Run an episode with the exported policy, recorded."""
     video = None
     with Policy.load(bundle) as policy:
         if settings.video:
@@ -121,7 +120,7 @@ def film(settings: Settings, bundle: Path, env_id: str, **arguments: Any) -> Non
         print(f"video: {video}")
 
 
-# CartPole: PPO with Tune, as one trains in earnest.
+# CartPole: PPO with Tune, as for a real training.
 
 
 def cartpole(settings: Settings) -> None:
@@ -174,14 +173,14 @@ def cartpole(settings: Settings) -> None:
 
 
 def algorithm_state(checkpoint: Path) -> None:
-    """Rebuild the whole algorithm, read its weights here and in every env runner, and write them back."""
+    """Rebuild the whole algorithm, read its weights here and in every env runner, and set them again."""
     from ray.rllib.algorithms.algorithm import Algorithm
 
     with training_run.stopping(Algorithm.from_checkpoint(str(checkpoint))) as algorithm:
         weights = algorithm.get_module().get_state()
         for name, array in weights.items():
             print(f"  {name:40} {np.shape(array)}")
-        # The same in each env runner; with several, a list of as many.
+        # The same in each env runner; if there are several, a list with one entry each.
         steps = algorithm.env_runner_group.foreach_env_runner(lambda runner: type(runner.module).__name__)
         print(f"env runners hold: {steps}")
         before = {name: np.array(array) for name, array in weights.items()}
@@ -195,7 +194,7 @@ def algorithm_state(checkpoint: Path) -> None:
 
 
 def distribution_and_value(checkpoint: Path, bundle: Path, obs: Any) -> None:
-    """Ask the RLModule, which needs no Ray, and the exported graph the same."""
+    """Compare the RLModule, which needs no Ray, with the exported graph."""
     import torch
     from ray.rllib.core.columns import Columns
     from ray.rllib.core.rl_module.rl_module import RLModule
@@ -268,7 +267,7 @@ def frozen_lake(settings: Settings) -> None:
         dueling=False,
         double_q=True,
         train_batch_size_per_learner=64,
-        training_intensity=16,  # an update in four steps
+        training_intensity=16,  # one update every four steps
         replay_buffer_config={"type": "EpisodeReplayBuffer", "capacity": 20_000},
     )
     config.rl_module(model_config={"fcnet_hiddens": [64]})

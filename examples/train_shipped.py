@@ -2,12 +2,12 @@
 
     python examples/train_shipped.py mir100_obstacle_avoidance
 
-`examples/checkpoints/NAME/training.yaml` says what is trained and when to stop; `--seed`, `--set` and `--settings`
-change that for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or,
-if the settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and
-`curve.png`. `--install` then puts the pruned checkpoint and the curve next to the settings. One process, one thread:
-RLlib samples in the driver, so that a run gives the same numbers again. How good a policy is afterwards
-`evaluate_shipped.py` measures, on other seeds.
+`examples/checkpoints/NAME/training.yaml` defines the training and its end; `--seed`, `--set` and `--settings` change
+that for one run. The run goes to `runs/NAME`: the best checkpoint so far (by the mean of the last episodes or, if the
+settings have `validation`, by episodes of the exported policy, without exploration), `curve.csv` and `curve.png`.
+`--install` then puts the pruned checkpoint and the curve next to the settings. One process, one thread: RLlib samples
+in the driver, so that a run gives the same numbers again. `evaluate_shipped.py` then measures the policy on other
+seeds.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         normalize_actions=settings.get("normalize_actions", True),
     )
     chosen = _chosen_episodes(settings)
-    # Under the environment's own name, which checkpoints keep: one that is restored elsewhere has no wrapper.
+    # Under the environment's own name, which checkpoints keep: elsewhere they are restored without the wrapper.
     if chosen["failed_share"] or chosen["out_of_reach_share"]:
         register_env(settings["env"], functools.partial(_make_chosen, settings["env"], chosen))
     else:  # registered by an earlier training in the same process
@@ -127,7 +127,7 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
     if "smoothness_loss_coeff" in shaping:
         config.training(learner_connector=lambda *_: AddNextObservationsFromEpisodesToTrainBatch())
     config.reporting(
-        # Off-policy algorithms report by default once a second, however much that is.
+        # By default off-policy algorithms report once a second, however many steps that is.
         min_time_s_per_iteration=0,
         min_sample_timesteps_per_iteration=settings.get("steps_per_iteration", 0),
     )
@@ -141,10 +141,10 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
 class ChosenEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Choose how episodes begin: some as one that failed, some with a target that is out of reach.
 
-    Where 19 of 20 episodes succeed, one in twenty shows what is missing: a share begins as one that failed began, until
-    it succeeds or 16 others have failed since. (After Jiang et al., Prioritized level replay, 2021, whose score is a
-    failure here.) Of the others a share has its target out of reach, by the environment's `extreme_options`: all that
-    can be done there is to wait until the time is over.
+    When 19 of 20 episodes succeed, only one in twenty shows what is missing: so a share of episodes begins like a
+    failed one, until that succeeds or 16 others have failed since. (After Jiang et al., Prioritized level replay, 2021;
+    the score here is a failure.) Of the others a share has its target out of reach, by the environment's
+    `extreme_options`: the policy can only wait until the time is over.
 
     The same seed gives the same episode. `info["is_ordinary"]` marks those that are neither.
     """
@@ -199,17 +199,17 @@ def _make_chosen(env_id: str, shares: dict[str, float], env_config: dict[str, An
 
 
 class ActionPenaltyLearner(PPOTorchLearner):
-    """PPO that also shapes the Gaussian it draws actions from. `learner_config_dict` says how:
+    """PPO that also shapes the Gaussian it draws actions from, by these entries of `learner_config_dict`:
 
-    `bounds_loss_coeff`: cost of a mean outside the action's bounds, by the square of its distance. Actions
-    are clipped there: with a mean of -2 whatever is drawn is -1, so that nothing is learned of driving slower.
-    rl_games, with which Isaac Gym's robots were trained, has it as `bounds_loss_coef`.
+    `bounds_loss_coeff`: cost of a mean outside the action's bounds, by the square of its distance. Actions are clipped
+    there: with a mean of -2 every draw is clipped to -1, so the policy cannot learn to drive slower. rl_games, which
+    trained Isaac Gym's robots, calls it `bounds_loss_coef`.
 
     `smoothness_loss_coeff`: cost of the mean's step from one observation to the next, by its square. Source: Mysore
     et al., Regularizing action policies for smooth control with reinforcement learning, 2021 (their temporal term).
 
     `largest_std`: the standard deviations' upper bound over environment steps, `[[0, 1.0], [1000000, 0.2]]`, of a
-    network with `free_log_std`. The last part is then learned near the actions that are taken later.
+    network with `free_log_std`. The last part is then trained near the actions that are taken later.
     """
 
     def build(self) -> None:
@@ -269,12 +269,12 @@ def _draw_orthogonal(*, algorithm: Algorithm, **_: Any) -> None:
 
 
 def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:
-    # Sums: RLlib's own means and windows are of one iteration's episodes, which are few or many.
+    # Sums: RLlib's own means and windows cover one iteration's episodes, which may be few or many.
     chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut at the end of a sampling phase
     total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))
     info = episode.get_infos(-1) or {}
     if not info.get("is_ordinary", True):
-        return  # the curve is of the episodes that the environment draws
+        return  # the curve counts only the episodes that the environment draws
     success, judgements = info.get("is_success", False), "is_success" in info
     for key, value in zip(SUMS, (1, judgements, total, length, success), strict=True):
         metrics_logger.log_value(("shipped", key), float(value), reduce="sum")
@@ -282,12 +282,12 @@ def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any 
 
 @dataclass
 class Validation:
-    """Which checkpoint is best, judged as the cards judge: exported, without exploration, on seeds of its own."""
+    """Choice of the best checkpoint, judged as in the cards: exported, without exploration, on its own seeds."""
 
     episodes: int
     seed: int
     env_steps: int  # from one to the next
-    above: float  # training success below which it is not worth the time
+    above: float  # training success below which validation is not worth the time
     _next: int = 0
 
     def is_due(self, row: Row) -> bool:
@@ -326,7 +326,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def change_settings(settings: dict[str, Any], changes: list[str]) -> None:
-    """Apply each `a.b=value` (YAML) to the settings. Raises ValueError for a setting that is not there."""
+    """Apply each `a.b=value` (YAML) to the settings. Raises ValueError for a setting that does not exist."""
     for change in changes:
         key, equals, value = change.partition("=")
         *parents, last = key.split(".")
@@ -353,7 +353,7 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
     while True:
         result = iterate(algorithm)
         sums = {key: float(value) for key, value in result["env_runners"].get("shipped", {}).items()}
-        if sums.get("episodes", 0.0) > 0.0:  # RLlib gives NaN where no episode ended
+        if sums.get("episodes", 0.0) > 0.0:  # RLlib gives NaN if no episode ended
             episodes += int(sums["episodes"])
             recent.append(sums)
             while sum(one["episodes"] for one in recent) - recent[0]["episodes"] >= window:
@@ -373,7 +373,7 @@ def iterations(algorithm: Algorithm, window: int) -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class Beginning:
-    """The network that training begins with, and the observed elements that it shall not know yet."""
+    """The network that training begins with, and the observed elements that it must forget."""
 
     checkpoint: Path
     forgotten: tuple[str, ...] = ()
@@ -381,8 +381,8 @@ class Beginning:
     def apply(self, algorithm: Algorithm, settings: dict[str, Any]) -> None:
         """Load the network and its observation filter.
 
-        An element that never moved in the first training (a fixed joint's velocity) was divided by next to nothing:
-        the network's weights on it mean nothing, and shake it as soon as the element moves. A forgotten one begins
+        An element that never moved in the first training (a fixed joint's velocity) was divided by next to nothing: the
+        network's weights on it mean nothing, and disturb it as soon as the element moves. A forgotten element begins
         with weights of 0 and a spread of 1. Raises UsageError for an element that the environment does not have.
         """
         learners, runners = algorithm.learner_group, algorithm.env_runner_group
@@ -531,7 +531,7 @@ def draw(rows: list[Row], title: str, path: Path) -> None:
 
 
 def install(name: str, folder: Path) -> None:
-    """Replace the shipped checkpoint and curve by those of `folder`."""
+    """Replace the shipped checkpoint and curve with those of `folder`."""
     from rlservo.export.prune_checkpoint import prune_checkpoint
 
     small = folder / "pruned"
@@ -546,14 +546,14 @@ def main() -> None:
     names = sorted(path.parent.name for path in SHIPPED.glob("*/training.yaml"))
     parser = argparse.ArgumentParser(description="Retrain one of the shipped policies.")
     parser.add_argument("name", choices=names)
-    parser.add_argument("--seed", type=int, help="instead of the one in training.yaml")
+    parser.add_argument("--seed", type=int, help="seed, instead of the one in training.yaml")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="changes",
         help="change a setting of training.yaml for this run, such as stop.env_steps=20000 or model.use_lstm=false",
     )  # fmt: skip
     parser.add_argument("--settings", type=Path, help="a file of your own instead of the policy's training.yaml")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for checkpoint and curve")
-    parser.add_argument("--install", action="store_true", help="replace the shipped checkpoint and curve by this run's")
+    parser.add_argument("--install", action="store_true", help="replace the shipped checkpoint and curve")
     args = parser.parse_args()
     settings = read_settings(args.settings or SHIPPED / args.name / "training.yaml")
     try:

@@ -4,7 +4,7 @@
 
 Without obstacles by default; `--obstacles` trains robo-gym's obstacle avoidance instead. The settings are those in
 examples/checkpoints/mir100_navigation/training.yaml and mir100_obstacle_avoidance/training.yaml, as far as RLlib itself
-knows them. The two policies are of train_shipped.py, which gives the network the logarithm of distances and the sine
+knows them. The two policies come from train_shipped.py, which gives the network the logarithm of distances and the sine
 and cosine of directions, lets the action's steps cost something (navigation), keeps its mean within the action's
 bounds, lets a collision cost more, and judges checkpoints without exploration (obstacle avoidance).
 """
@@ -18,7 +18,7 @@ from shared.training_inference import argument_parser, run, shipped_task
 from shared.training_run import main_with_sentences
 
 NAVIGATION = shipped_task("mir100_navigation")
-# Its file stops at a success rate, which this script does not; no return is as high as this one.
+# The file stops at a success rate, which this script does not know; no return reaches this value.
 OBSTACLES = replace(
     shipped_task("mir100_obstacle_avoidance"),
     env_id="rlservo.envs:rlservo/ObstacleAvoidanceMir100Sim-v0",

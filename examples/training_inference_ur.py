@@ -2,10 +2,9 @@
 
     python examples/training_inference_ur.py
 
-It trains from starts drawn around the start pose, at robo-gym's speed (a tenth of the joint velocity limits); the
-inference episodes start at the start pose itself.
-The policy that ships in examples/checkpoints/ur5_positioning was made by this script; its training.yaml holds the
-settings, its README the command.
+It trains at robo-gym's speed (a tenth of the joint velocity limits), from starts drawn around the start pose; the
+inference episodes start at that pose itself. The policy that ships in examples/checkpoints/ur5_positioning was
+made by this script; its training.yaml holds the settings, its README the command.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     rlservo serve runs/policies
     python examples/ur5_client.py --policy ur5-sb3
 
-Beside `training_inference_ur.py`, which does it with RLlib: the same environment, network, batches, rates and steps
+The counterpart of `training_inference_ur.py`, which uses RLlib: the same environment, network, batches, rates and steps
 (examples/checkpoints/ur5_positioning/training.yaml), in one process. It leaves `model.zip` and `vecnormalize.pkl` in
 `runs/ur5-sb3`, which is what `rlservo export` reads, and needs `pip install 'rlservo[sb3,sim]'`, no Ray.
 """
@@ -95,7 +95,7 @@ def main() -> None:
         description="Train UR5 end-effector positioning with Stable-Baselines3.", formatter_class=DefaultsFormatter
     )
     parser.add_argument("--stop-timesteps", type=int, default=settings["stop"]["env_steps"], help="environment steps")
-    parser.add_argument("--seed", type=int, default=settings["seed"], help="of training; episodes use 10000 and up")
+    parser.add_argument("--seed", type=int, default=settings["seed"], help="training seed; episodes use 10000 and up")
     parser.add_argument("--num-episodes-during-inference", type=int, default=100, help="episodes after training")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for model and bundle")
     args = parser.parse_args()

@@ -1,4 +1,4 @@
-"""The bare loop: a UR5 simulator driven by a policy that is served somewhere.
+"""The bare loop: a UR5 simulator driven by a served policy.
 
     rlservo export examples/checkpoints/ur_positioning --out policies --name ur5
     rlservo serve policies

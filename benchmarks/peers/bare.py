@@ -1,4 +1,4 @@
-"""The least that serves a policy with validation: uvicorn, FastAPI, pydantic and onnxruntime, and a bare WebSocket.
+"""Minimal server of a policy with validation: uvicorn, FastAPI, pydantic and onnxruntime, and a bare WebSocket.
 
     python benchmarks/peers/bare.py PORT POLICY.onnx
 

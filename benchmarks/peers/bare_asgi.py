@@ -1,4 +1,4 @@
-"""The least that serves a policy over HTTP: a bare ASGI application on uvicorn, orjson, onnxruntime. Checks nothing.
+"""Minimal server of a policy over HTTP: a bare ASGI application on uvicorn, orjson, onnxruntime. Checks nothing.
 
     python benchmarks/peers/bare_asgi.py PORT POLICY.onnx
 

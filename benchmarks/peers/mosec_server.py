@@ -1,6 +1,6 @@
 """Mosec with one worker, which reads and writes JSON: python mosec_server.py --port PORT, with POLICY_ONNX.
 
-Its front, which is written in Rust, hands each request to the worker's process.
+Its front end, written in Rust, hands each request to the worker's process.
 """
 
 # pyright: reportMissingImports=false
@@ -27,7 +27,6 @@ class PolicyWorker(Worker):  # type: ignore[misc]
         )
 
     def forward(self, data: Any) -> dict[str, Any]:
-        """Return the action."""
         obs = np.asarray(data["obs"], np.float32)[None]
         outputs: Any = self._session.run(["action"], {"obs": obs})
         return {"action": outputs[0][0].tolist()}

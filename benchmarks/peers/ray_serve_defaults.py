@@ -1,4 +1,4 @@
-"""A server as one first writes it with Ray Serve: a FastAPI ingress over onnxruntime, on Ray Serve's defaults.
+"""A first server with Ray Serve: a FastAPI ingress over onnxruntime, on Ray Serve's defaults.
 
 python benchmarks/peers/ray_serve_defaults.py PORT POLICY.onnx
 """
@@ -44,7 +44,7 @@ class PolicyServer:
 
 def main(port: int, onnx_file: str) -> None:
     stop = threading.Event()
-    # The dashboard is not on a request's way; without it the machine is quieter, which favours this peer.
+    # The dashboard is not on a request's path; without it the machine is quieter, which favours this peer.
     ray.init(include_dashboard=False, log_to_driver=False)
     for number in (signal.SIGTERM, signal.SIGINT):  # after ray.init, which installs its own
         signal.signal(number, lambda *_: stop.set())

@@ -1,7 +1,7 @@
 """RLlib's own example of serving an RLModule, unchanged, on Ray Serve's defaults (its proxy, no HAProxy).
 
 The deployment is `ray.rllib.examples.ray_serve.classes.cartpole_deployment`: a torch RLModule in the replica, JSON in
-and out. It answers an argmax whatever the policy is; its time is what is compared here, not its answer.
+and out. It answers an argmax whatever the policy is; only its time is compared here, not its answer.
 
     python benchmarks/peers/rllib_example.py PORT RL_MODULE_CHECKPOINT
 """
@@ -20,7 +20,7 @@ from ray.rllib.examples.ray_serve.classes.cartpole_deployment import ServeRLlibR
 
 def main(port: int, checkpoint: str) -> None:
     stop = threading.Event()
-    # The dashboard is not on a request's way; without it the machine is quieter, which favours this peer.
+    # The dashboard is not on a request's path; without it the machine is quieter, which favours this peer.
     ray.init(include_dashboard=False, log_to_driver=False)
     for number in (signal.SIGTERM, signal.SIGINT):  # after ray.init, which installs its own
         signal.signal(number, lambda *_: stop.set())

@@ -2,7 +2,7 @@
 
     RAY_SERVE_ENABLE_HA_PROXY=1 RAY_SERVE_THROUGHPUT_OPTIMIZED=1 python benchmarks/peers/rlservo_on_ray.py PORT POLICIES
 
-The bare one (`bare_asgi.py`) shows what Ray Serve itself takes.
+The bare one (`bare_asgi.py`) shows the cost of Ray Serve itself.
 """
 
 # No `from __future__ import annotations` here: Serve reads the type of `build`'s argument.
@@ -37,7 +37,7 @@ def bare(onnx_file: str) -> Any:
 
 def main(port: int, policies: str) -> None:
     stop = threading.Event()
-    ray.init(include_dashboard=False, log_to_driver=False)  # the dashboard is not on a request's way
+    ray.init(include_dashboard=False, log_to_driver=False)  # the dashboard is not on a request's path
     for number in (signal.SIGTERM, signal.SIGINT):  # after ray.init, which installs its own
         signal.signal(number, lambda *_: stop.set())
     try:

@@ -1,7 +1,7 @@
-"""Failures in RLlib's env runners: written next to the run, printed at once, and the end of a run that samples nothing.
+"""Failures in RLlib's env runners: written next to the run and printed at once; a run that samples nothing ends.
 
 If a sample fails, RLlib (2.60) logs the error in the env runner's process, ends that process and starts another. The
-process that trains sees an iteration without a step; the user sees nothing, and is left with an untrained policy.
+process that trains sees an iteration without a step; the user sees nothing and gets an untrained policy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FILE = "failures.txt"
 SAMPLED = "num_env_steps_sampled_lifetime"
 EVALUATED = f"evaluation/env_runners/{SAMPLED}"
 TRAINED = "learners/__all_modules__/num_env_steps_trained_lifetime"
-PATIENCE_S, PATIENCE = 180.0, 3  # no step for so long and in so many iterations: the training fails
+PATIENCE_S, PATIENCE = 180.0, 3  # the training fails after so long and so many iterations without a step
 MADE_AT_MOST = 100  # environments for one sample, where those that crash are made again
 PRINT_EVERY_S = 10.0  # while more of them fail
 BUILT_S = 60.0  # after an env runner failed to start
@@ -35,7 +35,7 @@ HEAD = "--- "  # begins the line that names a failure; its traceback follows
 
 
 def watch(config: AlgorithmConfig, folder: Path) -> None:
-    """Let a training's processes write failures into `folder`; it fails when nothing is sampled any more."""
+    """Let a training's processes write failures into `folder`; the training fails when it no longer samples."""
     file = folder / FILE
 
     class Watch(RLlibCallback):
@@ -62,7 +62,7 @@ def watch(config: AlgorithmConfig, folder: Path) -> None:
             self._sampling.is_due = True
             self._sampling.check(metric(result, SAMPLED))
             self._evaluating.check(metric(result, EVALUATED))
-            if self._evaluating.empty:  # RLlib repeats the results of the evaluation before
+            if self._evaluating.empty:  # RLlib repeats the previous evaluation's results
                 result["evaluation"]["env_runners"] = {}
 
     config.callbacks(callbacks_class=Watch)
@@ -80,7 +80,7 @@ def metric(result: Mapping[str, Any], name: str) -> float:
 
 @dataclass
 class Drought:
-    """Consecutive iterations without a step, of training or of evaluation."""
+    """Consecutive iterations without a step, in training or evaluation."""
 
     what: str
     file: Path
@@ -116,7 +116,7 @@ def _last_words(file: Path) -> str:
 
 
 def nothing_learned(steps: float, folder: Path | None = None) -> str:
-    """Return in words why a learner has seen no step of those that were sampled."""
+    """Return in words why a learner has seen none of the sampled steps."""
     if steps == 0:
         return "no step was sampled" + (_last_words(folder / FILE) if folder else "")
     return (

@@ -1,9 +1,9 @@
-"""Beginning of a training: the policy imitates a solution that its environment knows.
+"""Imitation at the start of a training: the policy is fitted to a solution that its environment knows.
 
-For `train_shipped.py`. An environment with `solution() -> action` (inverse kinematics, say) tells what ends at the
-target, whatever the arm does meanwhile: only the elements that decide it are looked at, and the policy's mean is fitted
-to it by least squares. What reinforcement learning then begins with reaches most targets; it improves on that, from all
-elements.
+For `train_shipped.py`. An environment with `solution() -> action` (such as inverse kinematics) gives an action that
+ends at the target, whatever the arm does meanwhile. The policy's mean is fitted to it by least squares, from only the
+elements that decide it. Reinforcement learning then begins with a policy that reaches most targets, and improves it
+with all elements.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from torch import Tensor
 from rlservo import errors
 
 BATCH = 512
-LAST_RATE = 0.01  # of the first learning rate, which falls along a cosine
+LAST_RATE = 0.01  # share of the first learning rate, which falls along a cosine
 
 
 @dataclass(frozen=True)
 class Imitation:
-    """How much is imitated: the settings `imitate` of a training.yaml."""
+    """Settings `imitate` of a training.yaml."""
 
     of: Sequence[str]  # the observed elements that decide the solution
     episodes: int  # one observation each
@@ -39,7 +39,7 @@ class Imitation:
 def fit_to_solution(module: Any, imitation: Imitation, settings: dict[str, Any], seen: list[int]) -> float:
     """Fit a PPO module's means to the environment's solution and return the root mean square error of the last batch.
 
-    `seen` are the columns of `imitation.of`; of the others the weights are 0 and stay so. Raises UsageError for an
+    `seen` are the columns of `imitation.of`; the weights of the others are 0 and stay 0. Raises UsageError for an
     environment without a solution, and for a network whose standard deviation is an output.
     """
     spread = [parameter for name, parameter in module.named_parameters() if name.endswith("log_std")]

@@ -36,7 +36,6 @@ class Count:
 
 
 def main(env_id: str, env_kwargs: Mapping[str, Any], description: str) -> None:
-    """Parse the command line and run the episodes."""
     parser = argparse.ArgumentParser(description=description, formatter_class=DefaultsFormatter)
     parser.add_argument(
         "checkpoint", type=Path, nargs="?",

@@ -1,6 +1,6 @@
 """Environment variables that every Ray process started from here needs, set before Ray is imported.
 
-Ray reads these when it is first imported, so whatever imports Ray imports this first.
+Ray reads these when it is first imported, so every module that imports Ray imports this first.
 """
 
 from __future__ import annotations

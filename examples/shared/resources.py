@@ -1,7 +1,7 @@
-"""Resources of a training run: refuse what cannot be had before anything starts, and name what is waited for.
+"""Resources of a training run: impossible requests are refused before anything starts, and waits are reported.
 
-RLlib's processes are bundles of CPUs and GPUs, each of which must fit one machine. Ray waits indefinitely, and without
-a word, for those that fit nowhere (ray 2.60).
+RLlib's processes are bundles of CPUs and GPUs, each of which must fit one machine. Ray waits indefinitely and silently
+for those that fit nowhere (ray 2.60).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def ray_room(name: str) -> Room:
 def request_of(config: AlgorithmConfig) -> list[dict[str, float]]:
     """Return the bundles of one trial: driver and learner first, then env runners, evaluation's, learners'.
 
-    Raises UsageError for amounts that are none.
+    Raises UsageError for invalid amounts.
     """
     try:
         factory = cast(Any, config.algo_class).default_resource_request(config.copy(copy_frozen=False))
@@ -76,7 +76,7 @@ def check_room(
     """Raise UsageError when a trial, or `concurrent` of them at once, cannot ever run there.
 
     `config` is the request's: with it the message has a number of env runners that fits. A cluster that may grow is not
-    judged by what it has now; `waiting_is_said` says what the run waits for.
+    judged by what it has now; `waiting_is_said` reports what the run waits for.
     """
     if room.grows:
         return
@@ -169,7 +169,7 @@ def _watch(done: threading.Event) -> None:
     printed_at: dict[str, float] = {}  # line -> when it was printed
     while not done.wait(POLL_S):
         try:
-            # A group's id ends with that of the job it belongs to; other jobs' are not ours to report.
+            # A group's id ends with its job's id; other jobs' groups are not ours to report.
             ours = {key: group for key, group in placement_group_table().items() if key.endswith(job)}
             pending = {key for key, group in ours.items() if group["state"] in ("PENDING", "RESCHEDULING")}
             now = time.monotonic()

@@ -57,7 +57,7 @@ NEW_NAMES = {
 def parse_settings(pairs: Sequence[str], option: str) -> dict[str, list[Any]]:
     """Return NAME=VALUE[,VALUE...] pairs as lists of YAML values (`1e-4` is also a number).
 
-    Raises UsageError naming the pair that is none.
+    Raises UsageError naming the malformed pair.
     """
     settings: dict[str, list[Any]] = {}
     for pair in pairs:
@@ -161,7 +161,7 @@ def validate(config: AlgorithmConfig, of: str = "this configuration") -> None:
 
 
 def check_combinations(config: AlgorithmConfig, space: Mapping[str, Any], at_most: int = 100) -> list[AlgorithmConfig]:
-    """Return the configuration of each combination of swept values: of lists all, of ranges one value.
+    """Return the configuration of each combination of swept values: all of a list's, one of a range's.
 
     Raises UsageError for one that RLlib would refuse.
     """

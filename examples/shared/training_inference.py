@@ -1,7 +1,7 @@
 """Train a robot's policy with RLlib and Tune, keep checkpoints, then run episodes with the best one.
 
-What `training_inference_ur.py` and `training_inference_mir.py` share: the command line of robo-gym's RLlib scripts on
-today's RLlib (new API stack). How a run goes is `training_run.py`.
+Shared by `training_inference_ur.py` and `training_inference_mir.py`: the command line of robo-gym's RLlib scripts on
+today's RLlib (new API stack). The run itself is in `training_run.py`.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def argument_parser(task: Task, description: str) -> argparse.ArgumentParser:
     parser.add_argument("--stop-reward", type=float, default=task.stop_reward, help="mean return at which to stop")
     parser.add_argument("--explore-during-inference", action="store_true", help="sample actions after training too")
     parser.add_argument("--num-episodes-during-inference", type=int, default=100, help="episodes after training")
-    parser.add_argument("--seed", type=int, default=0, help="of training; inference episodes use seed 10000 and up")
+    parser.add_argument("--seed", type=int, default=0, help="seed of training; inference episodes use 10000 and up")
     parser.add_argument("--num-envs-per-env-runner", type=int, default=8, help="simulators in each sampling process")
     parser.add_argument("--checkpoint-frequency", type=int, default=20, help="iterations between checkpoints")
     parser.add_argument("--storage", type=Path, default=Path("runs"), help="folder for results and checkpoints")
@@ -120,9 +120,9 @@ def gpus_asked_for(parser: argparse.ArgumentParser) -> float:
 
 
 def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: float = 0.0) -> AlgorithmConfig:
-    """Return the RLlib configuration: one core for the driver and learner, the others (at least two) sample.
+    """Return the RLlib configuration: one core for the driver and learner, the others (at least two) for sampling.
 
-    Sampling and learning take turns, so on one or two cores the processes share them: together they ask for no more.
+    Sampling and learning alternate, so on one or two cores the processes share them and request no more together.
     """
     config = training_run.default_config(args.run)
     config.environment(task.env_id, env_config=task.env_config, clip_rewards=False)

@@ -1,11 +1,11 @@
 """Run RLlib under Tune from a script: a private Ray, a progress table, Ctrl-C, resuming, the best checkpoint, a bundle.
 
-What `simple_trainer.py`, `training_inference_ur.py`, `training_inference_mir.py`, `tour.py` and `policy_from_cp_*.py`
-share.
+Shared by `simple_trainer.py`, `training_inference_ur.py`, `training_inference_mir.py`, `tour.py` and
+`policy_from_cp_*.py`.
 
 A run is a Tune experiment folder `<storage>/<algorithm>-<environment>-<time>`: one folder per trial with its
-checkpoints, `result.json`, `progress.csv` and TensorBoard's event file, and `run.json`, which is what resuming needs to
-know of the command line.
+checkpoints, `result.json`, `progress.csv` and TensorBoard's event file, and `run.json`, the part of the command line
+that resuming needs.
 """
 
 from __future__ import annotations
@@ -81,8 +81,6 @@ class Run:
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial's outcome."""
-
     name: str
     settings: dict[str, Any]  # the swept ones
     iterations: int
@@ -133,7 +131,7 @@ def default_config(algorithm: str, log_level: str = "ERROR") -> AlgorithmConfig:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         config: AlgorithmConfig = get_trainable_cls(algorithm).get_default_config()
-    # RLlib's 60 s before a failed env runner is started again are as long as it waits for a sample.
+    # RLlib's own 60 s before a failed env runner is restarted are as long as its wait for a sample.
     return config.fault_tolerance(delay_between_env_runner_restarts_s=1.0)
 
 
@@ -149,7 +147,7 @@ def ray_session(
     """Start a Ray of our own, or join the one at `address`; whatever is started here is gone afterwards.
 
     A private one has its own token and folder, so that neither RAY_ADDRESS nor another cluster on the machine is
-    reached, and nothing is left in the home folder. SIGTERM, as Slurm sends it, does what Ctrl-C does. `app_dir` is
+    reached, and nothing is left in the home folder. SIGTERM, which Slurm sends, does what Ctrl-C does. `app_dir` is
     where every process finds the user's own modules.
 
     Raises UsageError when the cluster cannot be reached.
@@ -221,12 +219,10 @@ def _join(address: str, quiet: Mapping[str, Any]) -> None:
 
 
 def cores() -> int:
-    """Return how many cores the running Ray has."""
     return int(ray.cluster_resources().get("CPU", 0))
 
 
 def local_gpus() -> float:
-    """Return how many GPUs torch sees here."""
     import torch
 
     return float(torch.cuda.device_count()) if torch.cuda.is_available() else 0.0
@@ -265,7 +261,7 @@ def _ignore_signals() -> Iterator[None]:
 
 
 def build(config: AlgorithmConfig) -> Any:
-    """Build an algorithm without Tune, in the Ray that runs. Raises UsageError when there is not the room for it."""
+    """Build an algorithm without Tune, in the Ray that runs. Raises UsageError if the resources do not suffice."""
     resources.check_room(resources.request_of(config), resources.ray_room("this machine"), config=config)
     with status("building the algorithm"):
         return config.build_algo()
@@ -308,10 +304,10 @@ def log_success(*, episode: Any, metrics_logger: Any, **_: Any) -> None:
 
 
 def fill_return(metric: str, mode: str) -> Callable[..., None]:
-    """Return RLlib's callback for a result: before the first episode has ended, the metric is the worst there is.
+    """Return RLlib's callback for a result: before the first episode has ended, the metric gets the worst value.
 
-    RLlib leaves it out or reports NaN, and then neither Tune's stop criteria, its schedulers nor its choice of the
-    checkpoints to keep know what to do (ray 2.60).
+    RLlib leaves it out or reports NaN, which Tune's stop criteria, its schedulers and its choice of checkpoints cannot
+    handle (ray 2.60).
     """
     *path, last = metric.split("/")
     worst = -math.inf if mode == "max" else math.inf
@@ -327,7 +323,7 @@ def fill_return(metric: str, mode: str) -> Callable[..., None]:
 
 
 class ProgressTable(tune.Callback):
-    """Prints a row per training iteration, under a header that comes again now and then, and failures as they come."""
+    """Prints a row per training iteration, under a header that is repeated now and then, and failures as they occur."""
 
     HEADER = "{:>8} {:>5} {:>12} {:>10} {:>8} {:>8} {:>10} {:>8} {:>8}".format(
         "trial", "iter", "steps", "return", "length", "success", "eval", "steps/s", "time"
@@ -358,7 +354,7 @@ class ProgressTable(tune.Callback):
             print(f"failed while sampling, {count} so far: {last} (all of them: {self._failures})", flush=True)
         waited_s = time.monotonic() - self._told_at
         if count and waited_s > failures.BUILT_S and all(trial.status == "PENDING" for trial in trials):
-            raise RuntimeError(f"{last}, after which the algorithm was not built")  # RLlib sometimes waits for good
+            raise RuntimeError(f"{last}, after which the algorithm was not built")  # RLlib sometimes waits indefinitely
 
     def on_trial_result(self, iteration: int, trials: Any, trial: Any, result: dict[str, Any], **info: Any) -> None:
         self._row_at, self._silence_s = time.monotonic(), SAID_AFTER_S
@@ -462,7 +458,7 @@ def _make_folder(storage: Path) -> Path:
 
 
 def _new_folder(storage: Path, name: str) -> Path:
-    """Make a folder of this name, or a longer one: jobs of an array begin in the same second."""
+    """Make a folder of this name, or a longer one: jobs of an array may begin in the same second."""
     try:
         folder = _make_folder(storage) / name
         while True:
@@ -661,7 +657,7 @@ def export_and_run(
     app_dir: Path = Path(),
     seed: int = 10_000,
 ) -> Path:
-    """Export the checkpoint and run episodes with the bundle, which acts as RLlib would: that is what export proves."""
+    """Export the checkpoint and run episodes with the bundle, which export has proven to act as RLlib does."""
     from rlservo import Policy, export_checkpoint, rollout
     from rlservo.serve_app.rollout.report import render_report
 

@@ -1,4 +1,4 @@
-"""Measure training for a moment, as benchmarks/training.py does; leaves its files. Runs in a Ray: `trainings.py`."""
+"""Measure training briefly, as benchmarks/training.py does, and keep its files. Runs in a Ray: `trainings.py`."""
 
 from __future__ import annotations
 

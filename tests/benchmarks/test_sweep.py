@@ -1,4 +1,4 @@
-"""The sweep: what it trains, how it judges, what it writes. Nothing is trained here."""
+"""The sweep's trainings, judgements and files. Nothing is trained here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark of how long training takes: when it stops, what it says and writes. Nothing is trained here."""
+"""The benchmark of training time: its end, its messages and files. Nothing is trained here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The training benchmark's parts for a moment: its clock, its limit, its files. The benchmark itself is not a test."""
+"""The training benchmark's parts: its clock, its limit, its files. The benchmark itself is not a test."""
 
 from __future__ import annotations
 

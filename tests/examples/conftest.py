@@ -1,4 +1,4 @@
-"""Scripts run as a user runs them, and what several tests look at: made once a session."""
+"""Scripts run as a user runs them, and results that several tests share: made once per session."""
 
 from __future__ import annotations
 

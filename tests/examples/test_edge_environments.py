@@ -1,4 +1,4 @@
-"""The trainer with environments at the edge. All real trainings."""
+"""The trainer with unusual environments. All trainings are real."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beginning with a solution: a network is fitted to inverse kinematics, from the elements that decide them alone."""
+"""Beginning with a solution: a network is fitted to inverse kinematics, from only the elements that decide them."""
 
 from __future__ import annotations
 

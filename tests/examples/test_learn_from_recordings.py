@@ -1,7 +1,7 @@
 """The script that learns from recordings: what RLlib's learners see is what the recorded policy saw and did.
 
 An algorithm with a learning rate of 0 shows it: BC's loss is the mean of the recorded log-probabilities, negated, and
-what comes out acts as what was recorded.
+the result acts as the recorded policy did.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The trainer on a cluster that is too small, one that grows, and one that loses a node. Real trainings."""
+"""The trainer on a cluster that is too small, one that grows, and one that loses a node. All trainings are real."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A policy's checkpoint in, episodes out, with the actions counted that needed clipping."""
+"""A policy's checkpoint in, episodes out, with a count of the actions that needed clipping."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests for more than there is: refused in a sentence, or named while they are waited for."""
+"""Requests for more resources than exist: refused in a sentence, or reported while a run waits."""
 
 from __future__ import annotations
 

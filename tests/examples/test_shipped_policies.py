@@ -1,7 +1,7 @@
 """The policies that ship: each exports, acts through Policy as well as its card says, and can be trained again.
 
-Seeds here are neither those of training nor those of the cards. What is asked for follows from the card: the number of
-successes below which a policy as good as the card's lower confidence bound falls once in ten thousand times.
+Seeds here are neither those of training nor those of the cards. The required number of successes follows from the card:
+a policy as good as the card's lower confidence bound falls below it once in ten thousand times.
 """
 
 from __future__ import annotations

@@ -147,7 +147,7 @@ WRONG: list[tuple[str, str]] = [
     ("--sweep num_workers=3", "use --num-cpus instead"),
     ("--sweep lr=1,2 --set lr=1", "lr is given twice"),
     ("--search-space nowhere.yaml", "cannot be read: No such file"),
-    ("--num-workers 3", "of older versions: use --num-cpus"),
+    ("--num-workers 3", "is obsolete: use --num-cpus"),
     ("--redis-password x", "use RAY_AUTH_MODE=token"),
     ("--resume .", "not the folder of a run"),
     ("--resume . --run PPO", "leave --run out"),

@@ -1,4 +1,4 @@
-"""The training scripts as a user starts them: a short real run, and what they refuse."""
+"""The training scripts as a user starts them: short real runs and refusals."""
 
 from __future__ import annotations
 

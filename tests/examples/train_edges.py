@@ -1,7 +1,7 @@
-"""Train on edge environments for a moment, as the trainer would; write what came of it to edges.json.
+"""Train briefly on unusual environments, as the trainer would, and write the outcomes to edges.json.
 
-Runs in a folder of its own and in a Ray of one core: `trainings.py`. Where Tune is not what an environment is at the
-edge of, its algorithm trains in this process: a trial's own process takes longer to start than to train.
+Runs in a folder of its own and in a Ray of one core: `trainings.py`. If an environment is not unusual for Tune, its
+algorithm trains in this process: a trial's own process takes longer to start than to train.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def train_here(config: Any, run: Any, storage: Path, stop: dict[str, float]) -> 
         result = algorithm.train()
         while all(result[name] < limit for name, limit in stop.items()):
             before, result = result, algorithm.train()
-            if result[training_run.STEPS] == before[training_run.STEPS]:  # the only runner is being made anew
+            if result[training_run.STEPS] == before[training_run.STEPS]:  # the only runner is being made again
                 time.sleep(0.2)
         return Path(algorithm.save_to_path(str(storage))), int(result[training_run.STEPS])
 

@@ -1,6 +1,6 @@
 """Train through `simple_trainer.py --address` on one cluster: too small, growing, and then losing a node.
 
-Prints, last, one JSON line: how each run ended and what it said.
+The last line it prints is JSON: how each run ended, and its output.
 """
 
 from __future__ import annotations

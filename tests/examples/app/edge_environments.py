@@ -1,4 +1,4 @@
-"""Environments at the edge, for the trainer's tests: `edge_environments:edge/Float64-v0` and the others below."""
+"""Unusual environments for the trainer's tests: `edge_environments:edge/Float64-v0` and the others below."""
 
 from __future__ import annotations
 
