@@ -1,4 +1,4 @@
-"""Simulated UR controllers: one on ports of its own (an address of 127.0.0.0/8) for each test that takes it."""
+"""Simulated UR controllers: one at its own address of 127.0.0.0/8 for each test that uses it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Small real bundles for the runtime and the server: an ONNX graph, TorchScript, golden vectors and hashes.
 
-They are written with `onnx.helper` and `rlservo.export.contract.bundle` alone, so that these tests need no exporter.
+They are written with only `onnx.helper` and `rlservo.export.contract.bundle`, so that these tests need no exporter.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Folders that cost much to make, kept in the user's cache between runs and shared by the processes of one run.
+"""Folders that are expensive to make, kept in the user's cache between runs and shared by the processes of one run.
 
-Each is named after what makes it, so that a change there makes it again.
+Each is named after a hash of what it is made of, so a change there makes it again.
 """
 
 from __future__ import annotations

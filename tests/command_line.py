@@ -1,7 +1,7 @@
 """The command line `rlservo` for tests: in a process of its own, or in this one.
 
-A process takes half a second of processor time to start, and ten times that if it imports RLlib: one of its own is
-for what a process does, and once for each kind of command.
+A process takes half a second of processor time to start, and ten times that if it imports RLlib: a separate process is
+used for what only a process does, and once for each kind of command.
 """
 
 from __future__ import annotations

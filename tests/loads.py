@@ -1,4 +1,4 @@
-"""Clients that never stop asking a server, and what they got."""
+"""Clients that send requests without a pause, and the replies they got."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of a process that make RLlib start sooner, and change nothing else; importing this module sets them.
+"""Process settings that only make RLlib start sooner; importing this module sets them.
 
 The tests' processes import it first (`conftest.py`), and so do Ray's workers of their trainings
 (`trainings.environment`).

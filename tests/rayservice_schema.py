@@ -1,8 +1,8 @@
 """Strict JSON schema of a KubeRay RayService, around Kubernetes' own pod templates.
 
 Written for these tests after the field names of KubeRay's API types (ray.io/v1, master of late 2026, Apache-2.0); no
-key outside it is taken, so a misspelt one fails here and not on a cluster, where it would be dropped without a word.
-Fields of features that we do not use (the autoscaler, the history server, RocksDB) are left out: add them when needed.
+other key is accepted, so a misspelt one fails here and not on a cluster, where it would be dropped silently. Fields of
+features that we do not use (the autoscaler, the history server, RocksDB) are left out: add them when needed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Robots that play LSTM episodes in sessions by id, give up at will, and compare every action with a policy's own."""
+"""Robots that play LSTM episodes in sessions by id, abandon some, and compare every action with a policy's own."""
 
 from __future__ import annotations
 

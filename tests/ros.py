@@ -45,7 +45,7 @@ class Process:
         self._selector.register(self.process.stdout, selectors.EVENT_READ)
 
     def read(self, wait_s: float) -> bool:
-        """Read what has been printed; return whether the output goes on."""
+        """Read what has been printed; return whether more output may come."""
         if self._selector.select(wait_s):
             assert self.process.stdout is not None
             part = os.read(self.process.stdout.fileno(), 65536)
@@ -120,7 +120,7 @@ class SlowServer:
 
 
 class Ros:
-    """A graph of its own: nobody else's nodes are in it."""
+    """A graph of its own, without other nodes."""
 
     def __init__(self) -> None:
         self._cleanup = contextlib.ExitStack()

@@ -1,6 +1,6 @@
-"""Another node of the graph, in a process with the real rclpy: a line of JSON asks, a line of JSON answers.
+"""Another node of the graph, in a process with the real rclpy: it answers each line of JSON with another.
 
-Run by `ros.Graph`; it imports nothing of rlservo's, so that names and types are spelled twice.
+Run by `ros.Graph`; it imports nothing from rlservo, so names and types are written twice.
 """
 
 from __future__ import annotations

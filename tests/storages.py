@@ -1,4 +1,4 @@
-"""Storages: moto's S3, a proxy before it that lies, and Redis."""
+"""Storages: moto's S3, a proxy in front of it that returns false data, and Redis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Policy stores: loaded as a server loads its folders, or made of policies at hand."""
+"""Policy stores: loaded as a server loads its folders, or made from given policies."""
 
 from __future__ import annotations
 

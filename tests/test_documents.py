@@ -1,4 +1,4 @@
-"""Documents: linked, bounded in size and width, and with all that the code has."""
+"""Documents: links, bounds on size and width, and completeness with respect to the code."""
 
 from __future__ import annotations
 

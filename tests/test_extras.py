@@ -1,4 +1,4 @@
-"""Extras one at a time, with nothing else installed: what a command lacks is one sentence, before it does anything."""
+"""Extras one at a time, with nothing else installed: a command first says in one sentence what it lacks."""
 
 from __future__ import annotations
 

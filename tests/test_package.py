@@ -1,4 +1,4 @@
-"""The public names of `import rlservo`: which there are, and what they import when. `make check` holds their types."""
+"""The public names of `import rlservo`: their list and what each imports; `make check` checks their types."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The oldest Python: every source is in its grammar, and where an interpreter is found, base and client run on each."""
+"""The oldest Python: every source file parses with its grammar, and base and client run on every interpreter found."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Everything `tritonclient[grpc]` can ask of the server, by the unchanged client in an environment of its own.
 
-python triton_grpc.py HOST:PORT KEY < {"obs": [[...], ...]}   prints what came back, as JSON.
+python triton_grpc.py HOST:PORT KEY < {"obs": [[...], ...]}   prints the replies, as JSON.
 """
 
 from __future__ import annotations

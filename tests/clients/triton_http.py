@@ -1,6 +1,6 @@
 """Everything `tritonclient[http]` can ask of the server, by the unchanged client in an environment of its own.
 
-python triton_http.py HOST:PORT < {"obs": [[...], ...]}   prints what came back, as JSON.
+python triton_http.py HOST:PORT < {"obs": [[...], ...]}   prints the replies, as JSON.
 """
 
 from __future__ import annotations

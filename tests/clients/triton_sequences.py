@@ -1,9 +1,9 @@
-"""Sequences as `tritonclient` keeps them, over every way it has, by the unchanged client in an environment of its own.
+"""Sequences as `tritonclient` keeps them, over all its transports, in an environment of its own.
 
 python triton_sequences.py HTTP_HOST:PORT GRPC_HOST:PORT MODEL KEY < {"obs": [[...], ...]}
 
 prints the actions, as JSON.
-Every way plays two interleaved sequences; the second one starts a step later, and sees the observations backwards.
+Each transport plays two interleaved sequences; the second one starts a step later, and sees the observations backwards.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The command line as a user types it: real commands, their output, their exit codes, their one-sentence errors.
 
-Each kind of command runs in a process of its own once, the others in this one (command_line.py).
+Each kind of command runs once in its own process, all others in this one (command_line.py).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Content of the image of deploy/Dockerfile: serving without torch, and no secret that lies beside it."""
+"""Content of the image of deploy/Dockerfile: serving without torch, and without the secrets beside it."""
 
 from __future__ import annotations
 

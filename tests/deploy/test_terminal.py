@@ -1,4 +1,4 @@
-"""The terminal: what is shown while something takes long, and the signals that end a program."""
+"""The terminal: progress of long operations, and the signals that end a program."""
 
 from __future__ import annotations
 

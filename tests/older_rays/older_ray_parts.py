@@ -1,4 +1,4 @@
-"""The user's own code in the checkpoints of older Rays."""
+"""The user's own code in the checkpoints of older Ray releases."""
 
 from __future__ import annotations
 

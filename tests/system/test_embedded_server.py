@@ -1,4 +1,4 @@
-"""The embedded server: its start, its end, and workers that are killed, stopped and replaced under load."""
+"""The embedded server: start, end, and workers that are killed, stopped and replaced under load."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""`rlservo serve s3://...`: versions published while it runs, and a restart with the storage away.
+"""`rlservo serve s3://...`: versions published while it runs, and a restart while the storage is unreachable.
 
-That one is ended by a second Ctrl-C, at once and with nothing left.
+A second Ctrl-C ends that one at once, and nothing is left.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The loop across both: a served policy drives robo-gym's own environment, from robo-gym's own Python.
+"""A served policy drives robo-gym's own environment, from robo-gym's own Python.
 
-And docs/how-to/robo-gym.md and real-arm.md, whose commands are run as they are written.
+The commands of docs/how-to/robo-gym.md and real-arm.md are run as printed.
 """
 
 from __future__ import annotations

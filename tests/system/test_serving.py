@@ -1,4 +1,4 @@
-"""The embedded server in a process of its own: what it answers and what it loads."""
+"""The embedded server in a process of its own: replies and loaded modules."""
 
 from __future__ import annotations
 

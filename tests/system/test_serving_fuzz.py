@@ -1,6 +1,6 @@
 """Malformed bodies, frames and messages against a real server: errors have a name, and nothing hangs.
 
-Seeded and bounded; RLSERVO_FUZZ=20 sends twenty times as much, RLSERVO_FUZZ_SEED changes what.
+Seeded and bounded; RLSERVO_FUZZ=20 sends twenty times as much, RLSERVO_FUZZ_SEED changes the input.
 """
 
 from __future__ import annotations

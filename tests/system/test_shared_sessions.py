@@ -1,4 +1,4 @@
-"""LSTM sessions over several processes with one Redis: killed, stopped, given up, and every action bit by bit."""
+"""LSTM sessions over several processes with one Redis: killed, stopped and abandoned, and every action bit for bit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The drive without a page: a policy drives a simulated robot, and what is asked of it happens between cycles."""
+"""The drive without a page: a policy drives a simulated robot, and requests take effect between cycles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Values that no person could choose, sent to a cockpit's page by a program: nothing ends, no traceback is written."""
+"""Values that no person could choose, sent to a cockpit's page by a program: nothing stops, no traceback is written."""
 
 from __future__ import annotations
 

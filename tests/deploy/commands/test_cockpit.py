@@ -1,4 +1,4 @@
-"""The command `rlservo cockpit`: it starts, it ends with nothing left, and bad input is a sentence."""
+"""The command `rlservo cockpit`: start, end without leftovers, and one sentence for bad input."""
 
 from __future__ import annotations
 

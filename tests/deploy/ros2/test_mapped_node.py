@@ -1,4 +1,4 @@
-"""A policy of no robot of ours as a node: elements by name or by a parameter file, from other nodes' messages."""
+"""A policy for an unknown robot as a node: elements by name or by a parameter file, from other nodes' messages."""
 
 from __future__ import annotations
 

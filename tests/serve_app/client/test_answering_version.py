@@ -1,4 +1,4 @@
-"""Versions that answer a client which names none: production's moves, canaries, and those it was not made for."""
+"""Versions that answer a client which names none: moves of production, canaries, and versions that do not fit it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits of a promotion, and counts read from metrics: when figures decide, and which metrics are not trusted."""
+"""Limits of a promotion, and counts read from metrics: decisive figures, and metrics that are not trusted."""
 
 from __future__ import annotations
 

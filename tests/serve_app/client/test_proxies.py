@@ -1,4 +1,4 @@
-"""The client's way to a server that is not on this machine: proxies of the environment, and TLS."""
+"""The client's path to a server on another machine: proxies of the environment, and TLS."""
 
 from __future__ import annotations
 

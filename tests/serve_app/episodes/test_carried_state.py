@@ -1,4 +1,4 @@
-"""Memories that clients carry: fed to the version they are of, over every protocol, with the last action in them."""
+"""Memory that clients carry: given to the version it belongs to, over every protocol, with the last action in it."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Server:
 
 @pytest.fixture(scope="module")
 def versions(leaky_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Policy]:
-    """Three graphs that take each other's states: two versions, and the second one exported anew."""
+    """Three graphs that take each other's states: two versions, and the second one exported again."""
     root = tmp_path_factory.mktemp("leaky")
     again = tmp_path_factory.mktemp("again")
     return {

@@ -1,4 +1,4 @@
-"""Memories over every protocol: real LSTM policies behind real sockets, compared with the same policies in process."""
+"""Recurrent state over every protocol: real LSTM policies behind real sockets, against the same ones in process."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_a_recurrent_policy_is_never_begun_anew_by_accident(ask: Ask, name: str)
     assert (status, reply["code"]) == (400, "bad-request")
     assert "remembers its episode: send 'state' ({} begins one" in reply["error"]
     status, reply = ask(f"/v1/policies/{name}/act", {"obs": plain(obs), "state": None})
-    assert status == 400  # what a generated client sends for a field that nobody set
+    assert status == 400  # what a generated client sends for an unset field
     (batch,) = observations(name, 1, rows=1)
     status, reply = ask(f"/v2/models/{name}/infer", {"inputs": tensors(batch, name)})
     assert status == 400 and "remembers its episode" in reply["error"]
@@ -329,7 +329,7 @@ def test_a_stream_begins_its_next_episode_with_the_bundle_that_is_there_now(
         Socket(port, "/v1/policies/lstm_box/stream?errors=keep") as stream,
     ):
         assert stream.ask(obs=obs)["session_step"] == 1
-        now = 1  # the same version, loaded anew
+        now = 1  # the same version, loaded again
         assert stream.ask(obs=obs)["code"] == "session-lost"
         assert stream.ask(obs=obs, reset=True)["session_step"] == 1
         assert stream.ask(obs=obs)["session_step"] == 2

@@ -1,6 +1,6 @@
-"""Requests of a session that its client gave up: whenever they arrive, they do not touch the episode begun after them.
+"""Abandoned requests of a session: whenever they arrive, they do not affect the next episode.
 
-Triton's clients send neither `seq` nor `timeout` unless told to; what they leave behind is a closed connection.
+Triton's clients send neither `seq` nor `timeout` unless told to; they leave only a closed connection.
 """
 
 from __future__ import annotations

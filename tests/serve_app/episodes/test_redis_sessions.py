@@ -1,4 +1,4 @@
-"""Sessions by id in a real Redis: two servers, one memory, and what goes wrong with the store."""
+"""Sessions by id in a real Redis: two servers, one memory, and faults of the store."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def servers(store: PolicyStore, served: Serve, redis_server: RedisServer) -> Ite
 
 
 def same(got: Any, expected: Any) -> None:
-    """Assert that an action in JSON is this one, bit by bit."""
+    """Assert that an action in JSON is this one, bit for bit."""
     np.testing.assert_array_equal(np.asarray(got, np.asarray(expected).dtype), expected)
 
 

@@ -1,4 +1,4 @@
-"""Sessions as a server keeps them: how many, for how long, under which key, and what a refusal leaves of them."""
+"""Sessions in a server: their number, lifetime and keys, and their state after a refusal."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_batch_takes_the_places_of_its_episodes(server: Server) -> None:
     assert server.act("too-wide", rows=2, reset=True)[0] == 200
     assert server.act("one", reset=True)[0] == 503
     assert server.act("one", reset=True, end=True)[0] == 200  # it is not kept
-    assert server.act("wide", rows=6)[0] == 200  # and those that are there go on
+    assert server.act("wide", rows=6)[0] == 200  # and existing ones continue
     assert server.act("wide", rows=3, reset=True)[0] == 200
     assert server.sessions.rows == 5
 

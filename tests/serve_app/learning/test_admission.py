@@ -1,4 +1,4 @@
-"""Admission of recorded episodes to learning: one that fits, and everything that does not, by its reason."""
+"""Admission of recorded episodes to learning: one that is used, and every reason for which others are not."""
 
 from __future__ import annotations
 

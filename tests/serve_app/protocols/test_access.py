@@ -1,6 +1,7 @@
-"""Access to routes: every route, in every spelling of its path, as bytes on a socket, with too little of a key.
+"""Access to routes: every route, in every spelling of its path, as bytes on a socket, with an insufficient key.
 
-A path that a check reads differently from the router is a way around the check, so no client that mends paths is used.
+A path that a check reads differently from the router is a way around the check, so no client that normalizes paths is
+used.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ AHEAD = 32  # requests on their way at once
 
 
 def spellings(path: str) -> Iterator[bytes]:
-    """Yield ways in which somebody might write a path."""
+    """Yield spellings of a path."""
     plain = path.encode()
     yield plain
     yield plain.upper()

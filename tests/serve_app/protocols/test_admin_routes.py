@@ -68,7 +68,7 @@ def key_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture
 def port(folder: Path, key_path: Path, served: Serve, tmp_path: Path) -> Iterator[int]:
-    """A server whose operator has a key and which asks nobody else for one; ur5 in 1 and 2, production 1."""
+    """A server on which only the operator needs a key; ur5 in 1 and 2, production 1."""
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
     control = PlanFollower(VersionLoader(Repository([folder])), plan_files(tmp_path), replica="only")
     config = {"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}},

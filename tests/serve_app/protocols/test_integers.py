@@ -1,4 +1,4 @@
-"""Integers over every protocol: the observation that was sent is acted on to its last digit, or refused."""
+"""Integers over every protocol: the policy gets them exactly, or the request is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers that no float can hold, wherever a client may put a number: refused with a sentence, over every protocol."""
+"""Numbers that no float can hold, in every field that takes one: refused with a sentence, over every protocol."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Open Inference Protocol over real bundles: Triton's own client, and by hand what that client never sends."""
+"""The Open Inference Protocol over real bundles: Triton's own client, and hand-made requests that it never sends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page at `/`: who gets it, what it opens, and what is seen of it in a real browser."""
+"""The page at `/`: its access and links, and its display in a real browser."""
 
 from __future__ import annotations
 
@@ -208,7 +208,7 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
     assert cells["Latency p50 / p99"].endswith(" ms, earlier") and "27 of 27 far; most 2 σ" in cells["Drift"]
     assert tab.evaluate(row("2"))["Drift"] == "nothing seen yet"
 
-    # The open contract, the focus and what is selected outlive what is shown anew.
+    # The open contract, the focus and the selection survive a refresh.
     tab.evaluate(f"{CONTRACT_BUTTON}.focus()")
     tab.press("Enter")
     tab.wait_for_text("Contract of ur5, version 1", "Observation, element by element", "obstacle z")

@@ -1,7 +1,7 @@
-"""Pages of other origins in a real browser, which try all that a browser lets them send to a policy server.
+"""Pages of other origins in a real browser, which send a policy server everything that a browser lets them send.
 
-The page is served three ways: by the policy server's own address, where its attempts get through (so that they are
-attempts); from another port; and under a name that has come to lead to the policy server ("DNS rebinding").
+The page is served in three ways: from the policy server's own address, where its requests succeed (which shows that
+they are valid); from another port; and under a name that now resolves to the policy server ("DNS rebinding").
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def target(
 
 
 def check_untouched(target: Target, report: dict[str, Any], plan: Any) -> None:
-    assert target.step() == 2, report  # nobody has moved the session since
+    assert target.step() == 2, report  # the session has not moved since
     assert target.control.plan == plan and target.control.store is not None
     assert target.control.store.names == ("leaky",)
     assert {report[name] for name in report if name.startswith("socket")} == {"refused"}, report

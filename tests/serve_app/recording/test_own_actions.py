@@ -1,4 +1,4 @@
-"""A module's own actions come back from what was sent: RLlib's unsquash and clip undone, clipped ones flagged."""
+"""A module's own actions, recovered from the sent ones: RLlib's unsquash and clip undone, clipped ones flagged."""
 
 from __future__ import annotations
 

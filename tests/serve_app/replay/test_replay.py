@@ -1,4 +1,4 @@
-"""A recording replayed through its own bundle differs in nothing; through another, in what differs."""
+"""Replays of a recording: its own bundle reproduces it, another one's changes are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Repositories behind URIs: published whole or not at all, fetched by hash, served while their storage is away."""
+"""Repositories behind URIs: published whole or not at all, fetched by hash, served while unreachable."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage
         ConflictError, match=r"ur5/1/SHA256SUMS holds another file than .* published by another command"
     ):
         publish(other, storage.uri)
-    put(made, storage.uri, "1")  # the same bundle goes on where it was left
+    put(made, storage.uri, "1")  # the same bundle continues where it stopped
 
 
 def test_a_list_of_objects_of_several_pages_is_read_to_its_end(storage: Storage) -> None:
@@ -385,7 +385,7 @@ def test_a_storage_that_keeps_something_else_than_it_was_given_publishes_nothing
         assert list(repository(storage, cache).look().digests) == [("ur5", "2")]
     storage.tell(None)
     if kept is None:
-        put(made, storage.uri, "1")  # what was kept is the same bundle's: it goes on from there
+        put(made, storage.uri, "1")  # the kept part is of the same bundle: it continues from there
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The graph that acts: no value head, and the same actions."""
+"""The acting graph: no value head, and the same actions."""
 
 from __future__ import annotations
 

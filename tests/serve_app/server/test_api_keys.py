@@ -1,4 +1,4 @@
-"""API keys: what a file may hold, when a server refuses to start, and who gets through over every protocol."""
+"""API keys: valid files, refused starts, and access over every protocol."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_without_a_known_key_every_protocol_answers_401_in_our_form(port: int, h
     assert caught.value.response.status_code == 401
     assert json.loads(caught.value.response.body or b"")["code"] == "unauthenticated"
     counted = call(port, "GET", "/metrics", None, authorization=f"Bearer {CELL}")[2].decode()
-    for protocol in ("http", "websocket"):  # whoever tries keys is seen
+    for protocol in ("http", "websocket"):  # rejected keys are counted
         assert f'{{code="unauthenticated",policy="",protocol="{protocol}"' in counted
 
 

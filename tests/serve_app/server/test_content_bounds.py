@@ -1,4 +1,4 @@
-"""Bounds of content: what no batch of observations needs is refused unparsed, and every batch that is allowed fits."""
+"""Bounds of content: bodies larger than any batch needs are refused unparsed, and every allowed batch fits."""
 
 from __future__ import annotations
 

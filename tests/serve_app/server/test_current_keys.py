@@ -1,4 +1,4 @@
-"""The key file is followed while the server runs: what revokes a key, what changes nothing, what is said of it."""
+"""The key file is followed while the server runs: changes that revoke a key, changes without effect, and their logs."""
 
 from __future__ import annotations
 

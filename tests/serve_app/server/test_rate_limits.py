@@ -1,4 +1,4 @@
-"""Rate limits per API key: over every protocol, by label, and only where a line says so."""
+"""Rate limits per API key: over every protocol, by label, and only for keys whose line sets one."""
 
 from __future__ import annotations
 

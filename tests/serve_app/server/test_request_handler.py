@@ -1,4 +1,4 @@
-"""A replica with more requests than it takes on: some are turned away at once, the others notice nothing."""
+"""A replica with more requests than it admits: some are refused at once, the others are unaffected."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_what_exceeds_the_queue_is_refused_at_once_and_the_rest_gets_its_own_act
             if refused:
                 break
         assert refused
-        for index, client in enumerate(clients[1:], start=1):  # once it is over, everybody is served again
+        for index, client in enumerate(clients[1:], start=1):  # once it is over, all clients are served again
             client.sendall(ask(OBS[index]))
             assert answer(client)[0] == 200
 

@@ -1,4 +1,4 @@
-"""A repository of many policies: what loading one of them costs does not grow with their number."""
+"""A repository of many policies: the cost of loading one does not grow with their number."""
 
 from __future__ import annotations
 

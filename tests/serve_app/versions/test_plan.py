@@ -1,4 +1,4 @@
-"""Every change of a plan: what may be asked for and what it does; no files, no server."""
+"""Every change of a plan: valid requests and their effects; no files, no server."""
 
 from __future__ import annotations
 

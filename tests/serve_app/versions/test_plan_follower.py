@@ -1,4 +1,4 @@
-"""Several processes over one plan in a repository, with real bundles: who serves what, and who is told."""
+"""Several processes that follow one plan in a repository, with real bundles."""
 
 from __future__ import annotations
 
