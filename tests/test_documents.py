@@ -15,8 +15,8 @@ import pytest
 import tomllib
 
 import rlservo
-from rlservo.serve_app.episodes.request import REQUEST_FIELDS
-from rlservo.serve_app.protocols import oip_grpc
+from rlservo.serve_app.protocols.oip_messages import STREAM, UNARY
+from rlservo.serve_app.protocols.request_fields import REQUEST_FIELDS
 
 ROOT = Path(__file__).resolve().parent.parent
 CARDS = ROOT / "examples" / "checkpoints"  # their tables of figures are written by evaluate_shipped.py
@@ -97,7 +97,7 @@ def test_the_reference_is_what_the_code_says(monkeypatch: pytest.MonkeyPatch) ->
 def test_the_protocols_page_names_every_field_and_grpc_method() -> None:
     text = (DOCS / "reference" / "protocols.md").read_text(encoding="utf-8")
     assert [name for name in REQUEST_FIELDS if f'"{name}"' not in text] == []
-    assert [name for name in (*oip_grpc.METHODS, "ModelInfer", "ModelStreamInfer") if f"`{name}`" not in text] == []
+    assert [name for name in (*UNARY, STREAM) if f"`{name}`" not in text] == []
 
 
 def test_every_public_name_has_a_docstring_and_is_on_the_python_page() -> None:

@@ -9,8 +9,8 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from rlservo.export.contract.errors import UnavailableError
-from rlservo.serve_app.protocols.oip_grpc import METHODS, Grpc
-from rlservo.serve_app.protocols.oip_messages import SERVICE, messages
+from rlservo.serve_app.protocols.oip_grpc import Grpc
+from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY, messages
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.wire.addresses import is_loopback
 
@@ -36,10 +36,8 @@ class GrpcServer:
                 ("grpc.max_connection_idle_ms", int(settings.stream_idle_s * 1000)),
             ],
         )
-        methods: dict[str, Any] = {
-            name: grpc.unary_unary_rpc_method_handler(self._unary(name)) for name in (*METHODS, "ModelInfer")
-        }
-        methods["ModelStreamInfer"] = grpc.stream_stream_rpc_method_handler(self._stream)
+        methods: dict[str, Any] = {name: grpc.unary_unary_rpc_method_handler(self._unary(name)) for name in UNARY}
+        methods[STREAM] = grpc.stream_stream_rpc_method_handler(self._stream)
         self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
         service: Any = health  # its asyncio part is not in its type stubs
         self._health = service.aio.HealthServicer()  # probed by orchestrators, without a key

@@ -16,7 +16,6 @@ from rlservo.serve_app.versions.policy_store import Decision
 SessionId: TypeAlias = str | int
 """Triton's clients number their sequences; 7 and "7" are different."""
 
-MAX_SEED = 2**63 - 1
 LONGEST_SESSION_ID = 128
 LONGEST_LABEL = LONGEST_SESSION_ID  # a header may have 16 KB
 
@@ -53,9 +52,7 @@ class Episode:
     last_action: Any = None  # the robot's last command, if the step from it is limited
 
 
-OPTIONS = ("explore", "seed", "seq", "deadline_ms", "timestamp")
 EPISODE_FIELDS = frozenset(each.name for each in fields(Episode))
-REQUEST_FIELDS = frozenset({"obs", *OPTIONS, *EPISODE_FIELDS})
 
 
 @dataclass(slots=True)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-import logging
 import secrets
 import time
 from collections.abc import Mapping
@@ -23,9 +22,7 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.episodes.request import ClientGoneError, Request
 from rlservo.serve_app.protocols.http_errors import (
-    JSON_HEADERS,
     Headers,
-    encode_bug,
     error_answer,
     missing_route,
     refuse_upgrade,
@@ -49,8 +46,6 @@ from rlservo.serve_app.server.api_keys import Access, Key
 from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send
-
-logger = logging.getLogger(__name__)
 
 HANG_UP_TURNS = 4
 
@@ -149,13 +144,9 @@ async def _reply_of(answer: Answer, call: Call) -> tuple[int, bytes, Headers]:
     """Return (status, body, headers), errors included."""
     try:
         return 200, *await answer(call)
-    except RlservoError as error:
-        call.audit.code = error.code
+    except Exception as error:
+        call.audit.code = error.code if isinstance(error, RlservoError) else InternalError.code
         return error_answer(error)
-    except Exception:
-        logger.exception("a request failed")
-        call.audit.code = InternalError.code
-        return 500, encode_bug(), JSON_HEADERS
 
 
 class HttpEndpoint:

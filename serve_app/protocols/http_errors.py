@@ -68,39 +68,32 @@ def status_of(error: RlservoError) -> int:
     return next((status for kind, status in STATUS if isinstance(error, kind)), 500)
 
 
-def error_answer(error: RlservoError) -> tuple[int, bytes, Headers]:
-    """Return (status, body, headers), and log an error of our own."""
+def describe(error: Exception) -> tuple[int, dict[str, Any], int | None]:
+    """Return (status, document without internal details, seconds to wait before another try); log our own faults."""
+    if not isinstance(error, RlservoError):
+        logger.error("a request failed", exc_info=error)
+        error = InternalError(BUG)
     status = status_of(error)
-    headers = JSON_HEADERS
-    if status == 503:
-        headers += ((b"retry-after", str(RETRY_AFTER_S).encode()),)
-    elif status == 429:
-        headers += ((b"retry-after", str(retry_after_s(error)).encode()),)
-    elif status == 401:
-        headers += ((b"www-authenticate", b"Bearer"),)
-    elif status >= 500 and not isinstance(error, InternalError):  # which is logged with its traceback
+    if status == 500 and not isinstance(error, InternalError):  # which is logged with its traceback
         logger.error("%s", error.message)
-    return status, encode_error(error), headers
-
-
-def retry_after_s(error: RlservoError) -> int:
-    """Return the whole seconds after which to retry."""
-    return max(RETRY_AFTER_S, math.ceil(float(error.details.get("retry_after_s", 0))))
-
-
-def encode_error(error: RlservoError) -> bytes:
-    """Return the body of an error, without internal details."""
-    if status_of(error) == 500 and not isinstance(error, ActionError):
-        return encode_bug()
+        if not isinstance(error, ActionError):
+            error = InternalError(BUG)
     document: dict[str, Any] = {"error": error.message, "code": error.code}
     if error.details:
         document["details"] = error.details
-    return encode_json(document)
+    wait_s = max(RETRY_AFTER_S, math.ceil(float(error.details.get("retry_after_s", 0))))
+    return status, document, wait_s if isinstance(error, UnavailableError) else None
 
 
-def encode_bug() -> bytes:
-    """Return the body of an unexpected error, whose cause clients are not told."""
-    return encode_json({"error": BUG, "code": "internal"})
+def error_answer(error: Exception) -> tuple[int, bytes, Headers]:
+    """Return (status, body, headers) for `describe`'s result."""
+    status, document, wait_s = describe(error)
+    headers = JSON_HEADERS
+    if wait_s is not None:
+        headers += ((b"retry-after", b"%d" % wait_s),)
+    elif status == 401:
+        headers += ((b"www-authenticate", b"Bearer"),)
+    return status, encode_json(document), headers
 
 
 def missing_route(method: str, path: str, allowed: Sequence[str]) -> tuple[int, str, bytes, Headers]:

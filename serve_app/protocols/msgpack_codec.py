@@ -14,8 +14,8 @@ from typing import Any
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import RequestError, TooLargeError
 from rlservo.export.contract.spaces import DictSpec
-from rlservo.serve_app.episodes.request import REQUEST_FIELDS, Episode, Request, reply_fields
-from rlservo.serve_app.protocols.json_codec import parse_episode, parse_options
+from rlservo.serve_app.episodes.request import Episode, Request, reply_fields
+from rlservo.serve_app.protocols.request_fields import ACT, fill_request, parse_fields
 from rlservo.serve_app.server.content_bounds import SMALL, check_length
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
@@ -59,13 +59,7 @@ class MsgpackCodec:
         else:
             request.obs = content["obs"]
             if len(content) > 1:
-                unknown = next((str(key)[:64] for key in content if key not in REQUEST_FIELDS), None)
-                if unknown is not None:
-                    raise RequestError(
-                        f"unknown field '{unknown}': expected one of {', '.join(sorted(REQUEST_FIELDS))}"
-                    )
-                parse_options(request, content)
-                request.episode = parse_episode(content)
+                request.episode = fill_request(request, parse_fields(ACT, content))
 
     def encode(self, request: Request, decision: Decision) -> bytes:
         """Return the reply's frame; `reply_options` are further timings."""

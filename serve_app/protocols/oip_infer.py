@@ -13,30 +13,25 @@ Specification: github.com/kserve/open-inference-protocol, and Triton's extension
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Annotated, Any
 
 import numpy as np
 import orjson
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, SkipValidation, TypeAdapter, with_config
+from typing_extensions import Required, TypedDict
 
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, OPTIONS, Episode, Request, SessionId, reply_fields
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, Episode, Request, reply_fields
 from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type, too_large
-from rlservo.serve_app.protocols.json_codec import parse_episode, parse_finite, parse_options
-from rlservo.serve_app.protocols.json_text import json_type, parse_json
-from rlservo.serve_app.protocols.oip_tensors import (
-    DTYPES,
-    datatype_of,
-    from_bytes,
-    parse_flag,
-    parse_tensor,
-    write_tensor,
-)
+from rlservo.serve_app.protocols.json_text import parse_json
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, read_inputs, write_tensor
+from rlservo.serve_app.protocols.request_fields import Options, fill_request, parse_fields, strict
 from rlservo.serve_app.protocols.routes import POST, Route, of_policy
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
@@ -49,19 +44,65 @@ LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensor
 BINARY = b"application/octet-stream"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
 LAST_ACTION = "last_action"  # inputs named like the outputs `action` and `action.<path>`
-STATE_POLICY = "state_policy"  # identity of the policy that the states belong to
-REQUEST_FIELDS = frozenset({"id", "parameters", "inputs", "outputs"})
-MODEL_NAME = "model_name"  # KServe's client repeats the path's name here
-# Parameters of the protocol and its clients besides our own options. Priority has no effect: there is no queue.
-OUTCOME = ("reward", "final_status", "truncated")  # parameters with the meaning that they have in JSON
-PARAMETERS = frozenset(
-    {*OPTIONS, *OUTCOME, "binary_data_output", "sequence_id", "sequence_start", "sequence_end", STATE_POLICY}
-)
-TIMEOUT = "timeout"  # [us] Triton's: how long the request may wait
-IGNORED = frozenset({"priority", TIMEOUT, "headers", "content_type"})
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits into one packet anyway
 COMPRESSION_LEVEL = 1  # a robot's numbers hardly compress, and a control loop waits for them
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
+
+
+@strict
+class Tensor(TypedDict, total=False):
+    """A tensor, in JSON or (with the parameter `binary_data_size`) as bytes after the JSON."""
+
+    name: Required[str]
+    shape: Required[list[int]]
+    datatype: Required[Annotated[str, Field(description="One of " + ", ".join(DTYPES))]]
+    parameters: dict[str, Any] | None
+    data: Annotated[Any, Field(description="Nested or flat, in row-major order.")]
+
+
+@with_config(ConfigDict(strict=True, extra="allow"))
+class OutputParameters(TypedDict, total=False):
+    """Parameters of a requested output."""
+
+    binary_data: Annotated[bool | None, Field(description="Reply with bytes after the JSON.")]
+
+
+@strict
+class RequestedOutput(TypedDict, total=False):
+    """An output to reply with."""
+
+    name: Required[str]
+    parameters: OutputParameters | None
+
+
+@strict
+class Parameters(Options, total=False):
+    """Parameters of a request: the options of the JSON protocol, and those of the protocol and its clients."""
+
+    binary_data_output: bool | None
+    sequence_id: int | Annotated[str, Field(max_length=LONGEST_SESSION_ID - 1)] | None
+    sequence_start: bool | None
+    sequence_end: bool | None
+    state_policy: Annotated[str | None, Field(description="From the reply that had the states.")]
+    timeout: Annotated[int | None, Field(ge=0, lt=2**64, description="[us] Triton's: how long it may wait.")]
+    priority: Annotated[Any, Field(description="Ignored: there is no queue.")]
+    headers: Annotated[Any, Field(description="Ignored.")]
+    content_type: Annotated[Any, Field(description="Ignored.")]
+
+
+@strict
+class InferRequest(TypedDict, total=False):
+    """Request a batch of actions."""
+
+    id: Annotated[str | None, Field(description="Echoed.")]
+    model_name: Annotated[str | None, Field(description="Same name as in the path; optional.")]
+    parameters: Annotated[Parameters | None, SkipValidation]  # checked on its own
+    inputs: Required[list[Tensor]]
+    outputs: list[RequestedOutput] | None
+
+
+INFER: TypeAdapter[InferRequest] = TypeAdapter(InferRequest)
+PARAMETERS: TypeAdapter[Parameters] = TypeAdapter(Parameters)
 
 
 def routes(handler: RequestHandler) -> list[Route]:
@@ -79,7 +120,7 @@ class ReplyOptions:
     """Whether outputs are bytes unless the request specifies each."""
     outputs: dict[str, bool]
     """The requested outputs, in order, and whether as bytes; empty means all."""
-    request_id: str | None = None
+    request_id: str | None
     """The protocol's own `id`, echoed."""
 
 
@@ -111,89 +152,78 @@ class OipHttpCodec:
             content = _decompress(content, encoding, self._handler.settings.max_body_bytes)
         view = memoryview(content)
         if length == 0 and len(view):
-            document: dict[str, Any] = {}
-            inputs = {contract.inputs[0].name: _raw_input(contract, view)}
-        else:
-            if len(view) > SMALL:
-                check_json(self._handler.store(), request.policy, view[:length], self._handler.settings.max_batch)
-            document, inputs, request.non_finite = _parse_document(view, length, request.policy)
-        fill_request(self._handler, request, document, inputs)
-        request.reply_options.request_id = document.get("id")
+            fill(self._handler, request, _document_of_raw(contract, view), view)
+            return
+        if length is not None and length > len(view):
+            raise RequestError(f"Inference-Header-Content-Length is {length}, but the body has {len(view)} bytes")
+        header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
+        if len(view) > SMALL:
+            check_json(self._handler.store(), request.policy, header, self._handler.settings.max_batch)
+        document, request.non_finite = parse_json(header, such_as=SUCH_AS)
+        fill(self._handler, request, document, raw)
 
     def encode(self, request: Request, decision: Decision) -> tuple[bytes, Headers]:
         """Return the reply's body and headers."""
-        answer = answer_of(request, decision)
-        reply: dict[str, Any] = {
-            "model_name": answer.name,
-            "model_version": answer.version,
-            "parameters": answer.parameters,
-        }
-        if request.reply_options.request_id is not None:
-            reply["id"] = request.reply_options.request_id
-        written = [write_tensor(name, array, binary=answer.binary[name]) for name, array in answer.outputs.items()]
-        reply["outputs"] = [tensor for tensor, _ in written]
+        reply, parts = reply_of(request, decision)
         content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
         headers = JSON_HEADERS
-        if any(answer.binary.values()):
+        if parts:
             headers = ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
-            content += b"".join(part for _, part in written)
+            content += b"".join(parts)
         accepted = request.headers.get(b"accept-encoding")
         if accepted is not None and len(content) >= SMALLEST_COMPRESSED:
             return _compress(content, headers, accepted.lower())
         return content, headers
 
 
-def fill_request(
-    handler: RequestHandler, request: Request, document: Mapping[str, Any], inputs: dict[str, NDArray[Any]]
-) -> None:
-    """Fill a request of either transport, whose `parameters` and `outputs` are in `document`.
+def fill(handler: RequestHandler, request: Request, document: Mapping[str, Any], raw: memoryview) -> None:
+    """Fill a request of either transport from its document and the bytes of its binary tensors.
 
     A deadline already set is the transport's own: the earlier one counts. Raises RequestError and ObservationError.
     """
-    parameters = document.get("parameters") or {}
-    if parameters:
-        _fill_options(request, parameters)
-    sequence = parameters.get("sequence_id")
-    identity = parameters.get(STATE_POLICY)
-    if identity is not None and not any(name.startswith(STATE_IN) for name in inputs):
-        identity = None  # there is no state that it could belong to
-    session_id = _session_id(sequence) if sequence else None
+    given: InferRequest = parse_fields(INFER, document)
+    if given.get("model_name") not in (None, request.policy):
+        raise RequestError(f"'model_name' differs from '{request.policy[:64]}', which the path names")
+    if not given["inputs"]:
+        raise RequestError(f"'inputs' must hold at least one tensor: send {SUCH_AS}")
+    inputs = read_inputs(given["inputs"], raw)
+    parameters: Parameters = parse_fields(PARAMETERS, given.get("parameters") or {}, "parameter")
+    timeout_us, transport_ms = parameters.get("timeout"), request.deadline_ms
+    request.deadline_ms = timeout_us / 1e3 if timeout_us else None
+    outcome = fill_request(request, parameters) or Episode()
+    if transport_ms is not None:
+        request.deadline_ms = transport_ms if request.deadline_ms is None else min(request.deadline_ms, transport_ms)
+    sequence = parameters.get("sequence_id") or None
+    identity = parameters.get("state_policy") if any(name.startswith(STATE_IN) for name in inputs) else None
     # The policy of the session, or of the state with that identity, even if the default has changed.
-    policy = handler.episodes.policy_of(handler.store(), request.policy, request.version, session_id, identity)
-    contract = policy.contract
-    binary = bool(parse_flag(parameters, "binary_data_output")) if parameters else False
-    outputs = _wanted_outputs(contract, document, parameters, binary=binary)
-    request.reply_options = ReplyOptions(contract, binary, outputs)
+    policy = handler.episodes.policy_of(handler.store(), request.policy, request.version, sequence, identity)
+    contract, binary = policy.contract, bool(parameters.get("binary_data_output"))
+    outputs = _wanted_outputs(contract, given, sequenced=sequence is not None, binary=binary)
+    request.reply_options = ReplyOptions(contract, binary, outputs, given.get("id"))
     request.obs = _observation(contract, inputs)
     if parameters or len(inputs) > 1:
-        request.episode = _episode(contract, inputs, parameters)
+        request.episode = _episode(contract, inputs, parameters, outcome)
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """A reply of either transport."""
-
-    name: str
-    version: str
-    parameters: dict[str, Any]
-    outputs: dict[str, NDArray[Any]]  # in the requested order
-    binary: dict[str, bool]  # by the same names: bytes or JSON
-
-
-def answer_of(request: Request, decision: Decision) -> Answer:
-    """Return the reply's fields by the protocol's names, and its tensors."""
+def reply_of(request: Request, decision: Decision) -> tuple[dict[str, Any], list[bytes]]:
+    """Return the reply's document, and the bytes of its binary tensors."""
     options: ReplyOptions = request.reply_options
     fields = reply_fields(request, decision)
-    name, version = fields.pop("policy"), fields.pop("version")
+    reply: dict[str, Any] = {"model_name": fields.pop("policy"), "model_version": fields.pop("version")}
     if "warnings" in fields:
         fields["warnings"] = "; ".join(fields["warnings"])
     if "session_id" in fields:
         fields["sequence_id"] = fields.pop("session_id")
     if "state" in fields:
-        fields[STATE_POLICY] = fields.pop("state")[BELONGS_TO]
+        fields["state_policy"] = fields.pop("state")[BELONGS_TO]
+    reply["parameters"] = fields
+    if options.request_id is not None:
+        reply["id"] = options.request_id
     outputs = _outputs(options.contract, decision)
     binary = options.outputs or dict.fromkeys(outputs, options.binary)
-    return Answer(name, version, fields, {name: outputs[name] for name in binary}, binary)
+    written = [write_tensor(name, outputs[name], binary=as_bytes) for name, as_bytes in binary.items()]
+    reply["outputs"] = [tensor for tensor, _ in written]
+    return reply, [part for _, part in written if part is not None]
 
 
 def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
@@ -205,60 +235,30 @@ def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
     return outputs
 
 
-def _parse_document(
-    view: memoryview, length: int | None, model: str
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]], bool]:
-    """Return (the JSON document, the inputs by name, whether the JSON held NaN)."""
-    if length is not None and length > len(view):
-        raise RequestError(f"Inference-Header-Content-Length is {length}, but the body has {len(view)} bytes")
-    header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
-    document, non_finite = parse_json(header, such_as=SUCH_AS)
-    if document.pop(MODEL_NAME, None) not in (None, model):
-        raise RequestError(f"'{MODEL_NAME}' differs from '{model[:64]}', which the path names")
-    unknown = next((field for field in document if field not in REQUEST_FIELDS), None)
-    if unknown is not None:
-        raise RequestError(f"unknown field '{unknown[:64]}': expected one of {', '.join(sorted(REQUEST_FIELDS))}")
-    if document.get("id") is not None and type(document["id"]) is not str:
-        raise RequestError(f"'id' must be a string, got {json_type(document['id'])}")
-    if document.get("parameters") is not None and type(document["parameters"]) is not dict:
-        raise RequestError(f"'parameters' must be an object, got {json_type(document['parameters'])}")
-    tensors = document.get("inputs")
-    if type(tensors) is not list or not tensors:
-        raise RequestError(f"'inputs' must be a list of tensors: send {SUCH_AS}")
-    inputs: dict[str, NDArray[Any]] = {}
-    offset = 0
-    for tensor in tensors:
-        name, array, offset = parse_tensor(tensor, raw, offset)
-        if name in inputs:
-            raise RequestError(f"input '{name[:64]}' is given twice")
-        inputs[name] = array
-    if offset != len(raw):
-        raise RequestError(f"the body has {len(raw) - offset} bytes after the last tensor's data")
-    return document, inputs, non_finite
-
-
-def _raw_input(contract: Contract, view: memoryview) -> NDArray[Any]:
-    """Read a body without JSON: the only input's bytes; their number gives the batch size."""
+def _document_of_raw(contract: Contract, view: memoryview) -> dict[str, Any]:
+    """Return the document for a body without JSON: the only input's bytes; their number gives the batch size."""
     if len(contract.inputs) != 1:
         names = ", ".join(tensor.name for tensor in contract.inputs)
         raise RequestError(f"a body without JSON is for models with one input; this one has {names}")
     tensor = contract.inputs[0]
-    dtype = DTYPES[datatype_of(tensor.dtype)]
-    row = dtype.itemsize * int(np.prod(tensor.shape[1:]))
+    datatype, inner = datatype_of(tensor.dtype), tensor.shape[1:]
+    row = DTYPES[datatype].itemsize * int(np.prod(inner))
     if len(view) % row:
         raise ObservationError(
             f"input '{tensor.name}' takes {row} bytes per observation, but the body has {len(view)}: not a multiple"
         )
-    return from_bytes(tensor.name, view, (len(view) // row, *tensor.shape[1:]), dtype)
+    parameters = {"binary_data_size": len(view)}
+    shape = [len(view) // row, *inner]
+    return {"inputs": [{"name": tensor.name, "shape": shape, "datatype": datatype, "parameters": parameters}]}
 
 
 def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
     """Return the policy's observation batch out of the named inputs, whose names and shapes are checked."""
-    listed: Sequence[TensorSpec] = contract.inputs
+    listed = [*contract.inputs]
     known = [tensor.name for tensor in listed]
     unknown = next((name for name in inputs if name not in known), None)
     if unknown is not None:  # a last action, which is an input that the contract does not list, or a mistake
-        listed = [*listed, *last_action_inputs(contract)]
+        listed += last_action_inputs(contract)
         unknown = next((name for name in inputs if all(name != tensor.name for tensor in listed)), None)
     if unknown is not None:
         raise ObservationError(f"policy '{contract.name}' has no input '{unknown[:64]}': expected {quoted(known)}")
@@ -282,44 +282,26 @@ def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
     return build_action(contract.observation_space, inputs, "obs")
 
 
-def _episode(contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Mapping[str, Any]) -> Episode | None:
-    """Return the episode fields of the inputs and parameters. Raises RequestError."""
+def _episode(
+    contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Parameters, outcome: Episode
+) -> Episode | None:
+    """Return the episode fields of the inputs and parameters."""
     states: dict[str, Any] = {
         name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
     }
-    belongs_to = parameters.get(STATE_POLICY)
-    if states and belongs_to is not None:
-        if type(belongs_to) is not str:
-            raise RequestError(f"'{STATE_POLICY}' must be the string from the last reply")
-        states[BELONGS_TO] = belongs_to
-    outcome = parse_episode({name: parameters[name] for name in OUTCOME if name in parameters}) or Episode()
-    reward = inputs.get(REWARD, outcome.reward)
-    last = _last_action(contract, inputs)
-    common: dict[str, Any] = {
-        "reward": reward, "last_action": last, "final_status": outcome.final_status, "truncated": outcome.truncated,
-    }  # fmt: skip
-    start, end = bool(parse_flag(parameters, "sequence_start")), bool(parse_flag(parameters, "sequence_end"))
-    sequence_id = parameters.get("sequence_id")
-    if sequence_id in (None, 0, ""):
-        if start and not states:  # a single step, for a client that carries the state afterwards
-            return Episode(state={}, **common)
-        if not states and all(value is None or value is False for value in common.values()):
-            return None
-        return Episode(state=states or None, **common)
-    return Episode(
-        state=states or None,
-        session_id=_session_id(sequence_id),
-        reset=start,
-        end=end,
-        **common,
+    if states and parameters.get("state_policy") is not None:
+        states[BELONGS_TO] = parameters["state_policy"]
+    sequence, starts = parameters.get("sequence_id") or None, bool(parameters.get("sequence_start"))
+    episode = replace(
+        outcome,
+        state={} if starts and not states and sequence is None else states or None,  # a client that will carry it
+        session_id=sequence,
+        reset=starts and sequence is not None,
+        end=bool(parameters.get("sequence_end")) and sequence is not None,
+        reward=inputs.get(REWARD, outcome.reward),
+        last_action=_last_action(contract, inputs),
     )
-
-
-def _session_id(sequence_id: Any) -> SessionId:
-    """Return a sequence's id as a session's; an integer and a string of its digits differ. Raises RequestError."""
-    if type(sequence_id) in (int, str) and len(str(sequence_id)) < LONGEST_SESSION_ID:
-        return sequence_id  # type: ignore[no-any-return]  # mypy does not narrow by the type's own identity
-    raise RequestError("'sequence_id' must be an integer, or a string of fewer than 128 characters")
+    return None if all(getattr(episode, field.name) is field.default for field in fields(Episode)) else episode
 
 
 def _last_action(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
@@ -342,53 +324,23 @@ def last_action_inputs(contract: Contract) -> list[TensorSpec]:
     ]
 
 
-def _fill_options(request: Request, parameters: Mapping[str, Any]) -> None:
-    """Set the request's options; refuse any that would otherwise be ignored silently."""
-    for name in parameters:
-        if name not in PARAMETERS and name not in IGNORED:
-            raise RequestError(
-                f"unknown parameter '{name[:64]}': expected one of {', '.join(sorted(PARAMETERS | IGNORED))}",
-                {"known": sorted(PARAMETERS | IGNORED)},
-            )
-    transport_ms = request.deadline_ms
-    parse_options(request, parameters)
-    timeout_us = parse_finite(parameters, TIMEOUT, "an integer of microseconds", kinds=(int,))
-    if request.deadline_ms is None and timeout_us:
-        request.deadline_ms = timeout_us / 1e3
-    if transport_ms is not None:
-        own_ms = request.deadline_ms
-        request.deadline_ms = transport_ms if own_ms is None else min(own_ms, transport_ms)
-
-
-def _wanted_outputs(
-    contract: Contract, document: Mapping[str, Any], parameters: Mapping[str, Any], *, binary: bool
-) -> dict[str, bool]:
+def _wanted_outputs(contract: Contract, given: InferRequest, *, sequenced: bool, binary: bool) -> dict[str, bool]:
     """Return the requested outputs, and whether as bytes; an empty result means all.
 
     Raises RequestError for outputs that do not exist.
     """
-    outputs = document.get("outputs")
-    if not outputs:
-        return {}
-    if type(outputs) is not list:
-        raise RequestError(f"'outputs' must be a list of {{\"name\": ...}}, got {json_type(outputs)}")
     known = [tensor.name for tensor in offered_outputs(contract)]
     wanted: dict[str, bool] = {}
-    for output in outputs:
-        name = output.get("name") if type(output) is dict else None
-        if type(name) is not str or name not in known:
-            given = json_type(output.get("name") if type(output) is dict else output)
-            shown = f" '{name[:64]}'" if type(name) is str else f" {given}"
-            raise RequestError(f"the output{shown} does not exist: expected {quoted(known)}")
-        if name.startswith(STATE_OUT) and parameters.get("sequence_id"):
+    for output in given.get("outputs") or ():
+        name, own = output["name"], output.get("parameters") or {}
+        if name not in known:
+            raise RequestError(f"the output '{name[:64]}' does not exist: expected {quoted(known)}")
+        if name.startswith(STATE_OUT) and sequenced:
             raise RequestError(f"the output '{name}' is kept with the sequence: request the action, or carry the state")
-        own = output.get("parameters") or {}
-        if type(own) is not dict:
-            raise RequestError(f"an output's 'parameters' must be an object, got {json_type(own)}")
         refused = next((name for name in ("classification", "shared_memory_region") if name in own), None)
         if refused is not None:
             raise RequestError(f"the output parameter '{refused}' is not supported: leave it out")
-        chosen = parse_flag(own, "binary_data")
+        chosen = own.get("binary_data")
         wanted[name] = binary if chosen is None else chosen
     return wanted
 

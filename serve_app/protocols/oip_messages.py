@@ -75,8 +75,7 @@ _MESSAGES: dict[str, list[str]] = {
     "RepositoryIndexRequest": ["string repository_name", "bool ready"],
     "RepositoryIndexResponse": ["repeated RepositoryIndexResponse.ModelIndex models"],
     "RepositoryIndexResponse.ModelIndex": ["string name", "string version", "string state", "string reason"],
-    # Triton's configuration and statistics, reduced to the fields filled here (`oip_models.py`). On the wire an
-    # enumeration is an int32: DATA_TYPES has its names.
+    # Triton's configuration and statistics, reduced to the fields filled here (`oip_models.py`).
     "ModelConfigRequest": ["string name", "string version"],
     "ModelConfigResponse": ["ModelConfig config"],
     "ModelConfig": [
@@ -90,13 +89,13 @@ _MESSAGES: dict[str, list[str]] = {
         "string backend = 17",
         "ModelConfig.TransactionPolicy model_transaction_policy = 19",
     ],
-    "ModelConfig.Input": ["string name = 1", "int32 data_type = 2", "repeated int64 dims = 4", "bool optional = 8"],
-    "ModelConfig.Output": ["string name = 1", "int32 data_type = 2", "repeated int64 dims = 3"],
+    "ModelConfig.Input": ["string name = 1", "DataType data_type = 2", "repeated int64 dims = 4", "bool optional = 8"],
+    "ModelConfig.Output": ["string name = 1", "DataType data_type = 2", "repeated int64 dims = 3"],
     "ModelConfig.SequenceBatching": [
         "uint64 max_sequence_idle_microseconds = 1",
         "repeated ModelConfig.State state = 5",
     ],
-    "ModelConfig.State": ["string input_name", "string output_name", "int32 data_type", "repeated int64 dims"],
+    "ModelConfig.State": ["string input_name", "string output_name", "DataType data_type", "repeated int64 dims"],
     "ModelConfig.TransactionPolicy": ["bool decoupled"],
     "ModelStatisticsRequest": ["string name", "string version"],
     "ModelStatisticsResponse": ["repeated ModelStatistics model_stats"],
@@ -123,8 +122,6 @@ _MESSAGES: dict[str, list[str]] = {
     "StatisticDuration": ["uint64 count", "uint64 ns"],
 }
 _DATA_TYPES = "INVALID BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP16 FP32 FP64"
-DATA_TYPES = {f"TYPE_{name}": number for number, name in enumerate(_DATA_TYPES.split())}
-"""Triton's numbers of the data types in a ModelConfig."""
 
 UNARY = (
     "ServerLive",
@@ -142,6 +139,12 @@ _METHODS = {name: f"{name}Request {name}Response" for name in UNARY}
 _METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
 
 messages: Any = SimpleNamespace(
-    **build_messages(PACKAGE, _MESSAGES, oneof="parameter_choice", services={"GRPCInferenceService": _METHODS})
+    **build_messages(
+        PACKAGE,
+        _MESSAGES,
+        oneof="parameter_choice",
+        enums={"DataType": [f"TYPE_{name}" for name in _DATA_TYPES.split()]},
+        services={"GRPCInferenceService": _METHODS},
+    )
 )
 """The classes by name; made at run time, they have no static type. A nested class is an attribute of its outer one."""

@@ -10,9 +10,13 @@ extension_statistics.md; github.com/triton-inference-server/common, protobuf/mod
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import orjson
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
 
 import rlservo
 from rlservo.export.contract.bundle import ONNX_FILE
@@ -28,8 +32,9 @@ from rlservo.serve_app.protocols.oip_infer import (
     offered_inputs,
     offered_outputs,
 )
-from rlservo.serve_app.protocols.oip_tensors import datatype_of, parse_flag
-from rlservo.serve_app.protocols.routes import GET, POST, Call, Route, of_policy
+from rlservo.serve_app.protocols.oip_tensors import datatype_of
+from rlservo.serve_app.protocols.request_fields import parse_fields, strict
+from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route, of_policy
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
@@ -50,65 +55,51 @@ STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
 BACKEND = "onnxruntime"
 LARGEST_INT32 = 2**31 - 1
 NOTHING = {"count": 0, "ns": 0}
+INDEX: TypeAdapter[Any] = TypeAdapter(strict(TypedDict("IndexFilter", {"ready": bool | None}, total=False)))
 
 
 def routes(handler: RequestHandler) -> list[Route]:
     """Return the routes of /v2 besides inference."""
 
-    async def live(_call: Call) -> tuple[bytes, Headers]:
-        return _json({"live": True})
+    def answer_of(method: Method) -> Answer:
+        async def answer(call: Call) -> tuple[bytes, Headers]:
+            found = method.document(handler, call.params.get("name", ""), call.params.get("version"))
+            return orjson.dumps(found), JSON_HEADERS
 
-    async def ready(_call: Call) -> tuple[bytes, Headers]:
-        handler.store()
-        return _json({"ready": True})
-
-    async def server(_call: Call) -> tuple[bytes, Headers]:
-        return _json(server_metadata())
-
-    async def metadata(call: Call) -> tuple[bytes, Headers]:
-        return _json(model_metadata(handler, *_named(call)))
-
-    async def model_ready(call: Call) -> tuple[bytes, Headers]:
-        return _json({"name": handler.store().get(*_named(call)).contract.name, "ready": True})
-
-    async def stats(call: Call) -> tuple[bytes, Headers]:
-        return _json({"model_stats": statistics(handler, call.params.get("name"), call.params.get("version"))})
-
-    async def config(call: Call) -> tuple[bytes, Headers]:
-        return _json(model_config(handler, *_named(call)))
+        return answer
 
     async def index(call: Call) -> tuple[bytes, Headers]:
         check_media_type(call.headers, JSON, BINARY, optional=True)
         if len(call.body) > SMALL:
             raise too_large(SMALL)
         document, _ = parse_json(call.body or b"{}", such_as='{"ready": true}')
-        return _json(repository_index(handler, ready=bool(parse_flag(document, "ready"))))
+        ready = bool(parse_fields(INDEX, document).get("ready"))
+        return orjson.dumps(repository_index(handler, ready=ready)), JSON_HEADERS
 
-    models = "/v2/models"
-    return [
-        Route(GET, "/v2/health/live", Access.open, "The process is alive", live),
-        Route(GET, "/v2/health/ready", Access.open, "The policies are loaded and proven", ready),
-        Route(GET, "/v2", Access.act, "The server and its extensions", server),
-        Route(GET, f"{models}/stats", Access.act, "Statistics of every model", stats),  # before a model of that name
-        *of_policy(GET, models, "", "Metadata of a model", answer=metadata),
-        *of_policy(GET, models, "/ready", "The model is loaded and proven", answer=model_ready),
-        *of_policy(GET, models, "/stats", "Statistics of a model", answer=stats),
-        *of_policy(GET, models, "/config", "Configuration of a model", answer=config),
-        Route(POST, "/v2/repository/index", Access.act, "All versions of all models", index),
-    ]
+    stats = answer_of(METHODS["ModelStatistics"])
+    found = [Route(GET, f"{MODELS}/stats", Access.act, "Statistics of every model", stats)]  # before that model's
+    for each in METHODS.values():
+        answer, suffix = answer_of(each), each.path.removeprefix(MODEL)
+        if suffix == each.path:
+            found.append(Route(GET, each.path, each.access, each.summary, answer))
+        else:
+            found += of_policy(GET, MODELS, suffix, each.summary, answer=answer)
+    return [*found, Route(POST, "/v2/repository/index", Access.act, "All versions of all models", index)]
 
 
-def _named(call: Call) -> tuple[str, str | None]:
-    return call.params["name"], call.params.get("version")
+def server_ready(handler: RequestHandler, *_named: Any) -> dict[str, Any]:
+    """Return that the policies are loaded. Raises UnavailableError."""
+    return {"ready": bool(handler.store())}
 
 
-def _json(document: Any) -> tuple[bytes, Headers]:
-    return orjson.dumps(document), JSON_HEADERS
-
-
-def server_metadata() -> dict[str, Any]:
+def server_metadata(*_named: Any) -> dict[str, Any]:
     """Return the server's name, version and extensions."""
     return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
+
+
+def model_ready(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
+    """Return that a model is loaded. Raises UnknownPolicyError, UnknownVersionError, UnavailableError."""
+    return {"name": handler.store().get(name, version).contract.name, "ready": True}
 
 
 def repository_index(handler: RequestHandler, *, ready: bool = False) -> list[dict[str, str]]:
@@ -188,22 +179,20 @@ def _sequences(handler: RequestHandler, policy: Policy) -> dict[str, Any]:
     }
 
 
-def statistics(handler: RequestHandler, name: str | None = None, version: str | None = None) -> list[dict[str, Any]]:
+def statistics(handler: RequestHandler, name: str = "", version: str | None = None) -> dict[str, Any]:
     """Return this replica's counts for each version since its start, as ModelStatistics.
 
     Without a `version`, all versions of the model; without a `name`, all models. All protocols count.
     Raises UnknownPolicyError, UnknownVersionError, UnavailableError, and RequestError for a version of no model.
     """
-    if name is None and version is not None:
+    if not name and version is not None:
         raise RequestError(f"the version '{version[:32]}' needs a model: also give its name")
     store = handler.store()
-    if name is None:
-        wanted = [(each, known) for each in store.names for known in store.versions(each)]
-    elif version is None:
-        wanted = [(name, known) for known in store.versions(name)]
+    if version is None:
+        wanted = [(each, known) for each in ([name] if name else store.names) for known in store.versions(each)]
     else:
         wanted = [(name, store.get(name, version).contract.version)]
-    return [_statistics(handler.metrics.totals(*which), *which) for which in wanted]
+    return {"model_stats": [_statistics(handler.metrics.totals(*which), *which) for which in wanted]}
 
 
 def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
@@ -231,3 +220,30 @@ def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
         },
         "batch_stats": [],
     }
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method of the protocol without an action: a route over HTTP, and a call with the same reply over gRPC."""
+
+    path: str
+    summary: str
+    document: Callable[[RequestHandler, str, str | None], dict[str, Any]]
+    """Returns the reply for a model's name and version: '' and None if the request has none."""
+    access: Access = Access.act
+    field: str = ""
+    """Field of gRPC's reply that holds the document."""
+
+
+MODELS = "/v2/models"
+MODEL = f"{MODELS}/{{name}}"
+METHODS = {
+    "ServerLive": Method("/v2/health/live", "The process is alive", lambda *_named: {"live": True}, Access.open),
+    "ServerReady": Method("/v2/health/ready", "The policies are loaded and proven", server_ready, Access.open),
+    "ServerMetadata": Method("/v2", "The server and its extensions", server_metadata),
+    "ModelMetadata": Method(MODEL, "Metadata of a model", model_metadata),
+    "ModelReady": Method(f"{MODEL}/ready", "The model is loaded and proven", model_ready),
+    "ModelStatistics": Method(f"{MODEL}/stats", "Statistics of a model", statistics),
+    "ModelConfig": Method(f"{MODEL}/config", "Configuration of a model", model_config, field="config"),
+}
+"""By gRPC's names."""

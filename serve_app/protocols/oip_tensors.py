@@ -7,6 +7,7 @@ github.com/kserve/open-inference-protocol, and Triton's extension_binary_data.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -34,7 +35,6 @@ DTYPES: dict[str, np.dtype[Any]] = {
 NAMES = {dtype.newbyteorder("="): name for name, dtype in DTYPES.items()}
 MAX_AXES = 32  # numpy itself stops at 64
 MOST_NUMBERS = 2**59  # numpy counts an array's bytes in 63 bits
-TENSOR_FIELDS = frozenset({"name", "shape", "datatype", "parameters", "data"})
 
 
 def is_shape(shape: Sequence[Any]) -> bool:
@@ -49,63 +49,54 @@ def datatype_of(dtype: str | np.dtype[Any]) -> str:
     return NAMES[np.dtype(dtype).newbyteorder("=")]
 
 
-def parse_tensor(document: Any, raw: memoryview, offset: int) -> tuple[str, NDArray[Any], int]:
-    """Return (name, array, offset after it); `offset` is where the tensor would begin in `raw`, were it binary.
+def read_inputs(tensors: Sequence[Mapping[str, Any]], raw: memoryview) -> dict[str, NDArray[Any]]:
+    """Return a request's inputs by name; those that give a `binary_data_size` are in `raw`, one after the other.
 
     Raises RequestError if the form is wrong, ObservationError if a number does not fit its datatype.
     """
-    if type(document) is not dict:
-        raise RequestError(f"every entry of 'inputs' must be an object, got {json_type(document)}")
-    name, datatype = document.get("name"), document.get("datatype")
-    shape: Any = document.get("shape")
-    if type(name) is not str:
-        raise RequestError(f"an input's 'name' must be a string, got {json_type(name)}")
-    label = name[:64]
-    unknown = next((field for field in document if field not in TENSOR_FIELDS), None)
-    if unknown is not None:
-        raise RequestError(f"input '{label}' has the unknown field '{unknown[:64]}': expected name, shape, ...")
-    parameters = document.get("parameters") or {}
-    if type(parameters) is not dict:
-        raise RequestError(f"input '{label}': 'parameters' must be an object, got {json_type(parameters)}")
-    dtype = check_form(label, shape if type(shape) is list else None, datatype, parameters)
-    size = parameters.get("binary_data_size")
-    if size is None:
-        return name, _from_json(label, document.get("data"), tuple(shape), dtype), offset
-    if "data" in document:
-        raise RequestError(f"input '{label}' has both 'data' and 'binary_data_size': send one of them")
-    if type(size) is not int or size < 0:
-        raise RequestError(f"input '{label}': 'binary_data_size' must be a number of bytes, got {json_type(size)}")
-    check_size(label, shape, dtype, size, "'binary_data_size' is")
-    if offset + size > len(raw):
-        raise RequestError(
-            f"input '{label}' needs {size} bytes after the JSON, but the body has {max(0, len(raw) - offset)} left"
-        )
-    return name, from_bytes(label, raw[offset : offset + size], tuple(shape), dtype), offset + size
+    inputs: dict[str, NDArray[Any]] = {}
+    offset = 0
+    names = [tensor["name"] for tensor in tensors]
+    if len(set(names)) < len(names):
+        raise RequestError(f"input '{Counter(names).most_common(1)[0][0][:64]}' is given twice")
+    for tensor in tensors:
+        name, shape, parameters = tensor["name"], tuple(tensor["shape"]), tensor.get("parameters") or {}
+        label = name[:64]
+        dtype = check_form(label, shape, tensor["datatype"], parameters)
+        size = parameters.get("binary_data_size")
+        if size is None:
+            inputs[name] = _from_json(label, tensor.get("data"), shape, dtype)
+            continue
+        if "data" in tensor:
+            raise RequestError(f"input '{label}' has both 'data' and 'binary_data_size': send one of them")
+        expected = math.prod(shape) * dtype.itemsize
+        if type(size) is not int or size != expected:
+            raise RequestError(
+                f"input '{label}' of shape {list(shape)} and datatype {tensor['datatype']} is {expected} bytes, but "
+                f"its size is {json_type(size)}"
+            )
+        if offset + size > len(raw):
+            raise RequestError(
+                f"input '{label}' needs {size} bytes after the JSON, but the body has {len(raw) - offset} left"
+            )
+        inputs[name] = from_bytes(label, raw[offset : offset + size], shape, dtype)
+        offset += size
+    if offset != len(raw):
+        raise RequestError(f"the body has {len(raw) - offset} bytes after the last tensor's data")
+    return inputs
 
 
-def check_form(label: str, shape: Sequence[Any] | None, datatype: Any, parameters: Mapping[str, Any]) -> np.dtype[Any]:
-    """Return the dtype of an input of either transport, whose bytes or numbers come next. Raises RequestError."""
-    if shape is None or not is_shape(shape):
+def check_form(label: str, shape: Sequence[Any], datatype: str, parameters: Mapping[str, Any]) -> np.dtype[Any]:
+    """Return the dtype of an input, whose bytes or numbers come next. Raises RequestError."""
+    if not is_shape(shape):
         raise RequestError(f"input '{label}': 'shape' must be a list of sizes such as [1, 27]")
     if datatype == "BYTES":
         raise RequestError(f"input '{label}' has datatype BYTES, which holds strings: send numbers")
-    dtype = DTYPES.get(datatype) if type(datatype) is str else None
-    if dtype is None:
-        given = f"'{datatype[:64]}'" if type(datatype) is str else json_type(datatype)
-        raise RequestError(f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got {given}")
+    if datatype not in DTYPES:
+        raise RequestError(f"input '{label}': datatype must be one of {', '.join(DTYPES)}, got '{datatype[:64]}'")
     if "shared_memory_region" in parameters:
         raise RequestError(f"input '{label}' is in shared memory, which this server does not read: send the data")
-    return dtype
-
-
-def check_size(label: str, shape: Sequence[int], dtype: np.dtype[Any], size: int, given: str) -> None:
-    """Raise RequestError unless a tensor's bytes match its shape; `given` names the source of `size`."""
-    expected = math.prod(shape) * dtype.itemsize
-    if size != expected:
-        raise RequestError(
-            f"input '{label}' of shape {list(shape)} and datatype {datatype_of(dtype)} is {expected} bytes, "
-            f"but its {given} {size}"
-        )
+    return DTYPES[datatype]
 
 
 def from_bytes(label: str, raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -141,7 +132,7 @@ def _leaf_types(data: list[Any]) -> set[type]:
     return types if list not in types else set().union(*map(_leaf_types, data))
 
 
-def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[str, Any], bytes]:
+def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[str, Any], bytes | None]:
     """Return the tensor's JSON and, in binary form, its bytes; `data` is the flat array, which orjson writes."""
     document: dict[str, Any] = {
         "name": name,
@@ -150,15 +141,7 @@ def write_tensor(name: str, array: NDArray[Any], *, binary: bool) -> tuple[dict[
     }
     if not binary:
         document["data"] = np.ascontiguousarray(array).ravel()
-        return document, b""
+        return document, None
     raw = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
     document["parameters"] = {"binary_data_size": len(raw)}
     return document, raw
-
-
-def parse_flag(parameters: Mapping[str, Any], name: str) -> bool | None:
-    """Return an optional boolean parameter. Raises RequestError when it is something else."""
-    value = parameters.get(name)
-    if value is None or type(value) is bool:
-        return value
-    raise RequestError(f"the parameter '{name}' must be true or false, got {json_type(value)}")

@@ -1,8 +1,7 @@
-"""OpenAPI document of the routing table, written by FastAPI, and the messages that it describes.
+"""OpenAPI document of the routing table, written by FastAPI, and the replies that it describes.
 
-FastAPI is imported when a client requests the document: it takes a third of a server's start. Requests are answered by
-the table itself and parsed by hand, in a microsecond where a pydantic model takes ten, with errors that name the
-mistake in the client's code.
+FastAPI is imported when a client requests the document: it takes a third of a server's start. The requests it shows are
+those that pydantic checks (`request_fields.py`, `oip_infer.py`).
 """
 
 from __future__ import annotations
@@ -15,62 +14,21 @@ from typing import Annotated, Any
 import orjson
 from fastapi import Body, FastAPI
 from fastapi.responses import JSONResponse, PlainTextResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 import rlservo
 from rlservo.export.contract.contract import Contract
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, MAX_SEED
-from rlservo.serve_app.protocols.oip_tensors import DTYPES
+from rlservo.serve_app.protocols.oip_infer import InferRequest, Tensor
+from rlservo.serve_app.protocols.request_fields import ActRequest
 from rlservo.serve_app.protocols.routes import WEBSOCKET, Route, RoutingTable
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed
 from rlservo.serve_app.versions.serving_plan import Canary
-from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 DESCRIPTION = "Actions from exported policies. Every error has a sentence, a code and, where useful, details."
 ANY_ROUTE = (400, 401, 403, 408, 413, 429)  # its path, key, host, page, body and rate
 OF_POLICY = (404, 503)
 OF_COMMAND = (*OF_POLICY, 409, 415)
 OF_ACTION = (*OF_COMMAND, 410, 422, 500)
-OBS = (
-    "One observation or a batch (distinguished by shape): nested lists in the observation space's shape or, if the "
-    "contract names the elements, a map from each name to a number (a batch: to a list of numbers). Dict spaces are "
-    "maps, Tuple spaces are lists of their parts."
-)
-
-
-class ActRequest(BaseModel):
-    """Request an action."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    obs: Any = Field(description=OBS)
-    explore: bool = Field(False, description="Sample the policy's action distribution instead of taking its mode.")
-    seed: int | None = Field(None, ge=0, le=MAX_SEED, description="Makes an exploring action repeatable.")
-    seq: int | None = Field(None, description="Echoed in the reply, so that a late reply is recognised.")
-    deadline_ms: float | None = Field(
-        None, description="Milliseconds left when the server receives the request. A late action is not computed."
-    )
-    timestamp: float | None = Field(
-        None, description="Your clock [s], echoed together with the server's times of receipt and reply."
-    )
-    state: dict[str, Any] | None = Field(
-        None, description="A recurrent policy's memory: {} begins an episode; then the last reply's `state`, unchanged."
-    )
-    session_id: str | None = Field(
-        None, min_length=1, max_length=LONGEST_SESSION_ID,
-        description="An id of your choice for requests that belong together; the policy's memory is kept under it.",
-    )  # fmt: skip
-    reset: bool = Field(False, description="Begin an episode: the first request of a recurrent policy's session.")
-    end: bool = Field(False, description="Forget the session after this request.")
-    reward: Any = Field(None, description="Reward of the last action: for policies that see it, and for recordings.")
-    last_action: Any = Field(
-        None, description="The robot's last command: needed if the action's step is limited, and for recordings."
-    )
-    final_status: str | None = Field(
-        None, min_length=1, max_length=LONGEST_STATUS,
-        description="How the episode ended: `obs` is the observation after the last action; the reply's is unused.",
-    )  # fmt: skip
-    truncated: bool = Field(False, description="With `final_status`: the episode was cut off, as by a time limit.")
 
 
 class ActReply(BaseModel):
@@ -96,34 +54,6 @@ class ErrorReply(BaseModel):
     error: str = Field(description="A sentence that names what was given, what was expected and the element.")
     code: str = Field(description="Kebab-case, for programs: for example `bad-observation`.")
     details: dict[str, Any] | None = None
-
-
-class Tensor(BaseModel):
-    """A tensor, in JSON or (with the parameter `binary_data_size`) as bytes after the JSON."""
-
-    name: str
-    shape: list[int]
-    datatype: str = Field(description="One of " + ", ".join(DTYPES))
-    parameters: dict[str, Any] | None = None
-    data: list[Any] | None = Field(None, description="Nested or flat, in row-major order.")
-
-
-class InferRequest(BaseModel):
-    """Request a batch of actions."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    id: str | None = Field(None, description="Echoed.")
-    parameters: dict[str, Any] | None = Field(
-        None,
-        description="`explore`, `seed`, `seq`, `deadline_ms`, `timestamp`, `sequence_id`, `sequence_start`, "
-        "`sequence_end`, `state_policy` (from the reply that had the states), `binary_data_output`.",
-    )
-    model_name: str | None = Field(None, description="Same name as in the path; optional.")
-    inputs: list[Tensor]
-    outputs: list[dict[str, Any]] | None = Field(
-        None, description='`[{"name": "action", "parameters": {"binary_data": true}}]` for bytes after the JSON.'
-    )
 
 
 class InferReply(BaseModel):

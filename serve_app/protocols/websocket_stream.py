@@ -22,6 +22,7 @@ from collections.abc import Mapping
 
 from rlservo.export.contract.errors import (
     ForbiddenError,
+    InternalError,
     OverloadedError,
     RlservoError,
     UnauthenticatedError,
@@ -29,7 +30,7 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.episodes.request import Request, new_episode_id
 from rlservo.serve_app.episodes.session import Session
-from rlservo.serve_app.protocols.http_errors import encode_bug, error_answer, fail_stream, refuse_upgrade
+from rlservo.serve_app.protocols.http_errors import error_answer, fail_stream, refuse_upgrade
 from rlservo.serve_app.protocols.json_text import encode_json
 from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
 from rlservo.serve_app.protocols.routes import WEBSOCKET, Route
@@ -44,7 +45,7 @@ from rlservo.serve_app.server.access_checks import (
 )
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.metrics import IDLE
-from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.server.request_handler import BUG, RequestHandler
 from rlservo.serve_app.wire.asgi import Message, Receive, Scope, Send
 
 logger = logging.getLogger(__name__)
@@ -120,7 +121,7 @@ class StreamEndpoint:
             logger.debug("a stream's client disconnected before its reply could be sent")
         except Exception:
             handler.record_bug(opening)
-            await fail_stream(send, encode_bug())
+            await fail_stream(send, error_answer(InternalError(BUG))[1])
         finally:
             idle.stop()
             if opening.stream is not None:

@@ -24,7 +24,6 @@ from rlservo.export.contract.errors import (
     RlservoError,
     TooLargeError,
     UnavailableError,
-    UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import ClientGoneError, Episode, Request, check_deadline
@@ -117,19 +116,6 @@ class RequestHandler:
         """Close the connections to other services."""
         if self.episodes.store is not None:
             await self.episodes.store.close()
-
-    @property
-    def ready(self) -> bool:
-        """Whether the policies are loaded."""
-        return self._store_provider() is not None
-
-    def has(self, name: str, version: str | None = None) -> bool:
-        """Whether a policy, in this version or under this alias, is loaded."""
-        store = self._store_provider()
-        try:
-            return store is not None and bool(store.get(name, version))
-        except UnknownPolicyError:
-            return False
 
     def policies(self) -> Iterator[tuple[str, str, Policy]]:
         """Yield (name, version, policy) of every loaded version."""

@@ -20,6 +20,7 @@ def build_messages(
     messages: Mapping[str, Sequence[str]],
     *,
     oneof: str = "choice",
+    enums: Mapping[str, Sequence[str]] | None = None,
     services: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, Any]:
     """Return the classes of a proto3 package by name.
@@ -27,10 +28,12 @@ def build_messages(
     `messages` lists each one's fields in the order of their numbers, or with explicit numbers: `int64 ns`,
     `repeated float action`, `map float limits` (from string), `bool ready = 17`. A type is a protobuf scalar or a
     message. A nested message is written Outer.Inner, after its outer one. `oneof` fields share their message's only
-    oneof, which is named `oneof`. `services` lists each service's methods, for reflection: `InferRequest
-    InferResponse`, `stream InferRequest stream InferResponse`.
+    oneof, which is named `oneof`. `enums` lists the values' names of each enumeration, from 0. `services` lists each
+    service's methods, for reflection: `InferRequest InferResponse`, `stream InferRequest stream InferResponse`.
     """
     file = descriptor_pb2.FileDescriptorProto(name=f"rlservo/{package}.proto", package=package, syntax="proto3")
+    for name, values in (enums or {}).items():
+        file.enum_type.add(name=name, value=[{"name": value, "number": at} for at, value in enumerate(values)])
     made: dict[str, Any] = {}
     for name, fields in messages.items():
         outer, _, inner = name.rpartition(".")
@@ -75,4 +78,4 @@ def _add_field(message: Any, package: str, path: str, number: int, declaration: 
     if kind in _TYPES:
         field.type = _TYPES[kind]
     else:
-        field.type, field.type_name = _Field.TYPE_MESSAGE, f".{package}.{kind}"
+        field.type_name = f".{package}.{kind}"  # of a message or an enumeration

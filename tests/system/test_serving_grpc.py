@@ -164,9 +164,9 @@ def test_discrete_policies_take_and_give_integers(call: Call, policies: Path) ->
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        (lambda m: m.raw_input_contents.append(b"\0" * 12), "540 bytes, but its raw_input_contents are 12"),
+        (lambda m: m.raw_input_contents.append(b"\0" * 12), "540 bytes, but its size is the number 12"),
         (lambda m: m.raw_input_contents.extend([b"", b""]), "1 inputs and 2 raw_input_contents"),
-        (lambda m: m.inputs[0].contents.fp32_contents.extend([1.0] * 9), "has 9 values, expected 135"),
+        (lambda m: m.inputs[0].contents.fp32_contents.extend([1.0] * 9), "has the shape [9], but 'shape' says [5, 27]"),
         (lambda m: m.inputs[0].contents.int_contents.extend([1] * 135), "belongs in 'fp32_contents'"),
         (lambda m: setattr(m.inputs[0], "datatype", "BYTES"), "holds strings: send numbers"),
         (lambda m: setattr(m.inputs[0], "datatype", "FP12"), "must be one of"),

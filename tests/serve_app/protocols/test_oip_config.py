@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
@@ -12,9 +13,9 @@ import numpy as np
 import pytest
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.oip_grpc import _numbered
+from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.protocols.oip_messages import messages
-from rlservo.serve_app.protocols.oip_models import model_config, statistics
+from rlservo.serve_app.protocols.oip_models import METHODS, statistics
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
@@ -101,8 +102,8 @@ def test_an_alias_means_its_version(store: PolicyStore) -> None:
     plan = PolicyPlan(versions={"1": "", "2": "", "10": ""}, aliases={"production": "2"})
     aliased = PolicyStore([store.get("ur5", version) for version in ("1", "2", "10")], {"ur5": plan})
     handler = create_app(lambda: aliased, ServerSettings()).handler
-    assert [each["version"] for each in statistics(handler, "ur5", "production")] == ["2"]
-    assert [each["version"] for each in statistics(handler, "ur5")] == ["1", "2", "10"]
+    assert [each["version"] for each in statistics(handler, "ur5", "production")["model_stats"]] == ["2"]
+    assert [each["version"] for each in statistics(handler, "ur5")["model_stats"]] == ["1", "2", "10"]
 
 
 def tensor(rows: int) -> dict[str, Any]:
@@ -158,10 +159,36 @@ def test_extensions_name_both(ask: Ask) -> None:
     assert {"model_configuration", "statistics"} <= set(ask("/v2")[1]["extensions"])
 
 
-def test_messages_take_every_field_of_the_documents(store: PolicyStore) -> None:
-    """A field that a message lacks is a ValueError: the two forms cannot drift apart."""
-    handler = create_app(lambda: store, ServerSettings()).handler
+class Context:
+    """A gRPC call without metadata; `failure` is its status if it failed."""
+
+    failure: Any = None
+
+    def invocation_metadata(self) -> list[Any]:
+        return []
+
+    def set_code(self, code: Any) -> None:
+        self.failure = code
+
+    set_details = set_trailing_metadata = lambda self, _value: None
+
+
+def over_grpc(store: PolicyStore, method: str, **fields: str) -> Any:
+    """Return the reply to a call without an action, None if it failed."""
+    handler, context = create_app(lambda: store, ServerSettings()).handler, Context()
+    asked = getattr(messages, f"{method}Request")(**fields).SerializeToString()
+    reply = asyncio.run(Grpc(handler).answer(method, (asked, None), context))
+    return reply if context.failure is None else None
+
+
+def test_grpcs_messages_take_every_field_of_the_documents(store: PolicyStore) -> None:
+    """A field that a message lacks fails the call: the two forms cannot drift apart."""
     for name in store.names:
-        config = messages.ModelConfigResponse(config=_numbered(model_config(handler, name, None))).config
+        for method in METHODS:
+            named = {} if method.startswith("Server") else {"name": name}
+            assert over_grpc(store, method, **named) is not None, method
+        config = over_grpc(store, "ModelConfig", name=name).config
         assert config.input[0].data_type in (9, 11) and config.name == name  # Triton's TYPE_INT64 and TYPE_FP32
-    assert len(messages.ModelStatisticsResponse(model_stats=statistics(handler)).model_stats) == 6
+    assert len(over_grpc(store, "ModelStatistics").model_stats) == 6
+    assert over_grpc(store, "ModelReady", name="ur5").ready and not over_grpc(store, "ModelReady", name="ur6").ready
+    assert over_grpc(store, "ModelMetadata", name="ur6") is None

@@ -210,17 +210,18 @@ def test_an_empty_tensor_that_numpy_cannot_make_is_refused(ask: Ask, more: dict[
     assert status == 400 and "'shape' must be" in reply["error"]
 
 
-def test_over_grpc_it_is_refused_too() -> None:
+def test_over_grpc_it_is_refused_too(store: PolicyStore) -> None:
     from rlservo.export.contract.errors import RequestError
-    from rlservo.serve_app.protocols import oip_grpc
+    from rlservo.serve_app.episodes.request import Request
+    from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
     from rlservo.serve_app.protocols.oip_messages import messages
 
-    grpc: Any = oip_grpc
+    codec = OipGrpcCodec(create_app(lambda: store, ServerSettings()).handler)
     for raw in ([b""], []):
-        asked = messages.ModelInferRequest(raw_input_contents=raw)
+        asked = messages.ModelInferRequest(model_name="ur5", raw_input_contents=raw)
         asked.inputs.add(name="obs", datatype="FP32", shape=[0, *[2**31 - 1] * 5])
         with pytest.raises(RequestError, match="'shape' must be"):
-            grpc._inputs(asked)
+            codec.parse(Request("grpc", "", None, 0.0), asked.SerializeToString())
 
 
 def test_a_body_that_unpacks_to_too_much_is_refused(ask: Ask) -> None:
@@ -253,7 +254,7 @@ def test_the_models_name_may_be_said_again(ask: Ask) -> None:
     [
         (b"", 400, "the request body is empty"),
         (b"[]", 400, "must be a JSON object such as {\"inputs\""),
-        ({"inputs": []}, 400, "'inputs' must be a list of tensors"),
+        ({"inputs": []}, 400, "'inputs' must hold at least one tensor"),
         ({"inputs": [7]}, 400, "must be an object, got the number 7"),
         (request(tensor(ROW, [1, 27])) | {"extra": 1}, 400, "unknown field 'extra'"),
         (request(tensor(ROW, [1, 27])) | {"model_name": "ur10"}, 400, "'model_name' differs from 'ur5'"),
@@ -284,8 +285,8 @@ def test_the_models_name_may_be_said_again(ask: Ask) -> None:
         (request(tensor(ROW, [1, 27]), outputs=[{"name": "action", "parameters": {"classification": 3}}]), 400, "not"),
         (request(tensor(ROW, [1, 27]), parameters={"binary_data_output": 1}), 400, "must be true or false"),
         (request(tensor(ROW, [1, 27]), parameters={"explor": True}), 400, "unknown parameter 'explor'"),
-        (request(tensor(ROW, [1, 27]), parameters={"seed": -1}), 400, "'seed' must be in 0.."),
-        (request(tensor(ROW, [1, 27]), parameters={"sequence_id": True}), 400, "'sequence_id' must be an integer, or"),
+        (request(tensor(ROW, [1, 27]), parameters={"seed": -1}), 400, "'seed' must be greater than or equal to 0"),
+        (request(tensor(ROW, [1, 27]), parameters={"sequence_id": True}), 400, "'sequence_id' must be an integer"),
         (request(tensor(ROW, [1, 27]), parameters={"deadline_ms": 0}), 408, "no action was computed"),
         (request(tensor([0.0] * 27 * 65, [65, 27])), 413, "a batch of 65 observations is too large: at most 64"),
     ],

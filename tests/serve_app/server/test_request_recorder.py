@@ -184,7 +184,7 @@ def test_the_client_tells_what_came_of_it(start: Callable[..., Server]) -> None:
 @pytest.mark.parametrize(
     ("field", "sentence"),
     [
-        ({"final_status": ""}, "'final_status' must be a string"),
+        ({"final_status": ""}, "'final_status' must have at least 1 character"),
         ({"truncated": 1}, "'truncated' must be true or false"),
     ],
 )
