@@ -57,8 +57,8 @@ class ConnectionLimits:
 
     def record(self, status: int, sentence: str, peer: str | None) -> None:
         """Count and log a request that was refused before the application got it."""
-        request = Request("http", "", None, time.perf_counter())
-        self._handler.record_failure(request, ERROR_CODES[status], sentence, peer=peer)
+        request = Request("http", "", None, time.perf_counter(), peer=peer)
+        self._handler.record_failure(request, ERROR_CODES[status], sentence)
 
 
 class _Refused(Exception):

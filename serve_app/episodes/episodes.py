@@ -59,13 +59,19 @@ class Episodes:
         """Requests for a session that does not exist or was lost, by policy name."""
 
     async def act(self, store: PolicyStore, request: Request) -> Decision:
-        """Decide for a request with episode fields, or on a stream that keeps an episode.
+        """Decide for a request: an action for one observation, a batch for a batch.
 
-        It waits only for a session in a shared store. Raises SessionError, SessionLostError, RequestError,
-        UnavailableError if there is no room or the store cannot be reached, and what `Policy.step` raises; the
-        recurrent state has then not changed.
+        It waits only for a session in a shared store. Raises UnknownPolicyError, UnknownVersionError, SessionError,
+        SessionLostError, RequestError, UnavailableError if there is no room or the store cannot be reached, and what
+        `Policy.step` raises; the recurrent state has then not changed.
         """
-        episode, stream = request.episode or NO_EPISODE, request.stream
+        episode, stream = request.episode, request.stream
+        if episode is None:
+            return (
+                _act_alone(store, request)
+                if stream is None
+                else self._act_on_stream(store, request, NO_EPISODE, stream)
+            )
         if episode.final_status is not None and (episode.reset or (episode.state is not None and not episode.state)):
             raise RequestError(
                 "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): "
@@ -84,12 +90,7 @@ class Episodes:
             return self._act_from_carried(store, request, episode)
         if stream is not None:
             return self._act_on_stream(store, request, episode, stream)
-        policy = _choose(store, request)
-        if policy.contract.state:
-            raise StateNeededError(f"policy '{request.policy}' {NEEDS_STATE}")
-        if policy.has_step_limit and episode.last_action is None:
-            raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
-        return _take_step(policy, request, episode)[0]
+        return _act_alone(store, request, episode)
 
     def policy_of(
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
@@ -207,6 +208,16 @@ class Episodes:
 
 
 NO_EPISODE = Episode()
+
+
+def _act_alone(store: PolicyStore, request: Request, episode: Episode = NO_EPISODE) -> Decision:
+    """Act for a request that needs nothing from earlier ones."""
+    policy = _choose(store, request)
+    if policy.contract.state:
+        raise StateNeededError(f"policy '{request.policy}' {NEEDS_STATE}")
+    if policy.has_step_limit and episode.last_action is None:
+        raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
+    return _take_step(policy, request, episode)[0]
 
 
 def _choose(store: PolicyStore, request: Request) -> Policy:

@@ -80,6 +80,8 @@ class Request:
     label: str | None = None
     """Name that the client gave itself: during a canary, all requests with one label get the same version."""
     request_id: str | None = None
+    peer: str | None = None
+    """The client's address, for the log; given if the request may be refused before it is routed."""
     headers: Mapping[bytes, bytes] = field(default_factory=dict)
     """Headers of an HTTP message, or metadata of a gRPC call."""
     is_fresh: bool = False

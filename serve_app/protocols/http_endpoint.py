@@ -132,8 +132,9 @@ class PolicyApp:
 
     async def _refuse(self, scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
         headers, own = scope[HEADERS], scope[REPLY_HEADERS]
-        request = Request(scope["type"], "", None, time.perf_counter(), request_id=header_text(headers, REQUEST_ID))
-        self.handler.record_failure(request, error.code, error.message, peer=peer_of(scope))
+        request = Request(scope["type"], "", None, time.perf_counter(), peer=peer_of(scope))
+        request.request_id = header_text(headers, REQUEST_ID)
+        self.handler.record_failure(request, error.code, error.message)
         if scope["type"] == "http":
             await send_error(send, error, headers=own)
         else:

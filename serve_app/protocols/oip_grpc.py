@@ -8,11 +8,13 @@ request's were.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import ipaddress
 import secrets
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 from urllib.parse import unquote
 
@@ -24,10 +26,10 @@ from google.protobuf.message import DecodeError
 from rlservo.export.contract.errors import (
     DeadlineError,
     ForbiddenError,
-    RateLimitError,
     RequestError,
     RlservoError,
     TooLargeError,
+    UnauthenticatedError,
     UnavailableError,
     UnknownPolicyError,
 )
@@ -122,6 +124,7 @@ class Grpc:
         idle_s = handler.settings.stream_idle_s
         try:
             opening = self._begin("ModelStreamInfer", context)
+            opening.peer = context.peer()
             opening.label = opening.label or secrets.token_hex(8)  # one version for all when a canary runs
             handler.open_stream(opening)
         except Exception as error:
@@ -137,23 +140,13 @@ class Grpc:
                 except asyncio.TimeoutError:
                     _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
                     return
-                request = Request(
-                    PROTOCOL, "", None, time.perf_counter(), label=opening.label, request_id=opening.request_id
-                )
+                request = replace(opening, received=time.perf_counter(), arrived=time.perf_counter())
                 try:
-                    key.check()
-                    request.may_explore = key.may_explore
-                except RlservoError as error:
-                    peer = context.peer()
-                    handler.record_failure(request, error.code, error.message, peer=peer)
-                    if not isinstance(error, RateLimitError):  # the key is no longer accepted
-                        _fail(context, error)
-                        return
-                    yield _error_reply(error, content)
-                    continue
-                try:
-                    reply = await handler.answer(self._codec, request, (content, None))
+                    reply = await handler.answer(self._codec, request, (content, None), key)
                     yield messages.ModelStreamInferResponse(infer_response=reply)
+                except UnauthenticatedError as error:  # the key is no longer accepted
+                    _fail(context, error)
+                    return
                 except RlservoError as error:
                     yield _error_reply(error, content)
         finally:
@@ -180,8 +173,8 @@ class Grpc:
             key = authorize(self._handler.keys, presented_key(headers), access)
             request.may_explore = key is None or key.may_explore
         except RlservoError as error:
-            peer = context.peer()
-            self._handler.record_failure(request, error.code, error.message, peer=peer)
+            request.peer = context.peer()
+            self._handler.record_failure(request, error.code, error.message)
             raise
         return request
 
@@ -205,7 +198,8 @@ class OipGrpcCodec:
         """Fill the request. Raises RequestError, ObservationError, UnknownPolicyError."""
         message = _parse(messages.ModelInferRequest, content)
         request.policy, request.version = message.model_name, message.model_version or None
-        store, contract = self._handler.store(), self._handler.store().get(request.policy, request.version).contract
+        store = self._handler.store()
+        store.get(request.policy, request.version)
         if len(content) > SMALL:
             check_length(store, request.policy, content, self._handler.settings.max_batch)
         for field in ("inputs", "outputs", "parameters", "raw_input_contents"):
@@ -214,8 +208,8 @@ class OipGrpcCodec:
         document, raw = _document_of(message)
         oip_infer.fill(self._handler, request, document, memoryview(b"".join(raw)))
         # A reply is bytes altogether or typed fields altogether, and not every type has a field.
-        outputs = oip_infer.offered_outputs(contract)
         options = request.reply_options
+        outputs = oip_infer.offered_outputs(options.contract)
         options.binary = bool(raw) or any(datatype_of(tensor.dtype) not in FIELDS for tensor in outputs)
         options.outputs = dict.fromkeys(options.outputs, options.binary)
 
@@ -271,12 +265,8 @@ def _tensor(tensor: Any, raw: bytes | None) -> dict[str, Any]:
 
 def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return parameters as plain values, without those that have none."""
-    plain = {}
-    for name, value in given.items():
-        choice = value.WhichOneof("parameter_choice")
-        if choice is not None:
-            plain[name] = getattr(value, choice)
-    return plain
+    chosen = {name: (value, value.WhichOneof("parameter_choice")) for name, value in given.items()}
+    return {name: getattr(value, choice) for name, (value, choice) in chosen.items() if choice is not None}
 
 
 def _parse(kind: Any, content: bytes) -> Any:
@@ -286,19 +276,12 @@ def _parse(kind: Any, content: bytes) -> Any:
         raise RequestError(f"the message is not a {kind.DESCRIPTOR.name}: {error}") from None
 
 
-def _id_of(content: bytes) -> str:
-    """Return the id of a request that failed, if it can be read."""
-    try:
-        return str(messages.ModelInferRequest.FromString(content).id)
-    except DecodeError:
-        return ""
-
-
 def _error_reply(error: RlservoError, content: bytes) -> Any:
-    """Return a stream's reply to a request that failed."""
-    return messages.ModelStreamInferResponse(
-        error_message=describe(error)[1]["error"], infer_response=messages.ModelInferResponse(id=_id_of(content))
-    )
+    """Return a stream's reply to a request that failed, with its id if that can be read."""
+    reply = messages.ModelStreamInferResponse(error_message=describe(error)[1]["error"])
+    with contextlib.suppress(DecodeError):
+        reply.infer_response.id = messages.ModelInferRequest.FromString(content).id
+    return reply
 
 
 def _fail(context: Any, error: Exception) -> None:

@@ -21,7 +21,6 @@ import time
 from collections.abc import Mapping
 
 from rlservo.export.contract.errors import (
-    ForbiddenError,
     InternalError,
     OverloadedError,
     RlservoError,
@@ -55,7 +54,6 @@ GOING_AWAY = 1001
 KEEP = b"errors=keep"
 PROTOCOL = "websocket"
 SILENT = "silent for too long"
-REVOKED = (UnauthenticatedError, ForbiddenError)  # possible failures of a stream's key
 
 
 def routes(handler: RequestHandler) -> list[Route]:
@@ -173,15 +171,9 @@ class _Conversation:
         self._idle.touch()
         self._is_fresh = False
         try:
-            try:
-                self._key.check()
-                request.may_explore = self._key.may_explore
-            except RlservoError as error:
-                handler.record_failure(request, error.code, error.message)
-                raise
-            reply = await handler.answer(self._codec, request, message)
+            reply = await handler.answer(self._codec, request, message, self._key)
         except RlservoError as error:
-            if not self._keeps or isinstance(error, REVOKED):  # which ends every stream
+            if not self._keeps or isinstance(error, UnauthenticatedError):
                 raise
             return {"type": "websocket.send", "text": _with_seq(error_answer(error)[1], request.seq)}
         taken_s = time.perf_counter() - request.received

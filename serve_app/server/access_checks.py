@@ -140,18 +140,17 @@ class StreamKey:
         self._changes = -1
         self._key: Key | None = None
 
-    def check(self) -> None:
-        """Check the key for one more request. Raises as `authorize` does; RateLimitError concerns only this request."""
+    def check(self) -> bool:
+        """Return whether the key may ask for exploring actions, after checking it for one more request.
+
+        Raises as `authorize` does; RateLimitError concerns only this request.
+        """
         if self._changes != self._keys.changes:
             changes = self._keys.changes
             self._key = authorize(self._keys, self._presented, Access.act)
             self._changes = changes
         elif self._key is not None and self._key.limit is not None:
             self._keys.limits.spend(self._key, self._key.limit)
-
-    @property
-    def may_explore(self) -> bool:
-        """Whether the key that was checked last may ask for exploring actions."""
         return self._key is None or self._key.may_explore
 
 

@@ -95,14 +95,14 @@ class RequestLog:
         fields["batch"] = decision.batch or 1
         _requests.info("answered", extra={FIELDS: fields})
 
-    def write_failure(self, request: Request, code: str, sentence: str, *, peer: str | None = None) -> None:
-        """Write a request that got no action; `peer` is the client's address, given if it was not routed."""
+    def write_failure(self, request: Request, code: str, sentence: str) -> None:
+        """Write a request that got no action."""
         if not _requests.isEnabledFor(logging.INFO):
             return
         version = request.version and request.version[:32]
         fields = _fields(request, request.policy[:64], version, code, time.perf_counter() - request.received)
-        if peer is not None:
-            fields["peer"] = peer
+        if request.peer is not None:
+            fields["peer"] = request.peer
         if self._values:
             fields["error"] = sentence
         _requests.info("refused", extra={FIELDS: fields})

@@ -28,6 +28,7 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import ClientGoneError, Episode, Request, check_deadline
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.content_bounds import count_rows, most_rows
@@ -132,12 +133,16 @@ class RequestHandler:
             raise UnavailableError("the policies are still being loaded: try again shortly")
         return store
 
-    async def answer(self, codec: Codec[Source, Reply], request: Request, source: Source) -> Reply:
-        """Return the reply; the codec reads from `source`.
+    async def answer(
+        self, codec: Codec[Source, Reply], request: Request, source: Source, key: StreamKey | None = None
+    ) -> Reply:
+        """Return the reply; the codec reads from `source`. A stream's `key` is checked for each of its requests.
 
         Raises RlservoError, which has been counted and logged, and ClientGoneError.
         """
         try:
+            if key is not None:
+                request.may_explore = key.check()
             content = await codec.receive(request, source)
             self._admit(request)
             self.store()  # being not ready takes precedence over any fault of the request
@@ -175,8 +180,7 @@ class RequestHandler:
     async def decide(self, request: Request) -> Decision:
         """Decide, unless its deadline has passed.
 
-        Raises DeadlineError, LateError, SessionError, TooLargeError, UnavailableError and what `PolicyStore.act` and
-        `Episodes.act` raise.
+        Raises DeadlineError, TooLargeError and what `Episodes.act` raises.
         """
         store, name, obs = self.store(), request.policy, request.obs
         if request.deadline_ms is not None and (time.perf_counter() - request.received) * 1e3 >= request.deadline_ms:
@@ -184,12 +188,7 @@ class RequestHandler:
         single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
         if (len(obs) if single else most_rows(obs)) > self._max_batch:
             self._check_batch(store, request)
-        if request.episode is not None or request.stream is not None:
-            decision = await self.episodes.act(store, request)
-        else:
-            decision = store.act(
-                name, request.version, obs, explore=request.explore, seed=request.seed, label=request.label
-            )
+        decision = await self.episodes.act(store, request)
         shadow = store.shadow(name)
         if shadow is not None and decision.version == shadow.of and not request.explore:
             self.shadows.offer(shadow, obs, decision)
@@ -201,14 +200,12 @@ class RequestHandler:
         code: str,
         sentence: str,
         *,
-        peer: str | None = None,
         asked: str | None = None,
         counted_as: str | None = None,
     ) -> None:
         """Count and log a request that got no action; requests for unknown names share one count.
 
-        `peer` is the client's address, logged if the request was refused before it was routed; `asked` is the version
-        that failed, if one was asked; `counted_as` is the code in the metrics, if it differs.
+        `asked` is the version that failed, if one was asked; `counted_as` is the code in the metrics, if it differs.
         """
         name, version = request.policy, request.version
         store = self._store_provider()
@@ -219,7 +216,7 @@ class RequestHandler:
         else:  # an alias counts as its version, no version as the default
             version = store.default(name) if version is None else store.version_of(name, version)
         self.metrics.count_failure(request.protocol, name, version, counted_as or code)
-        self.log.write_failure(request, code, sentence, peer=peer)
+        self.log.write_failure(request, code, sentence)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
         """Count a request that failed with the current exception, and log its traceback."""

@@ -1,4 +1,4 @@
-"""Loaded policies of a server by name, version and alias, and the one call of every protocol, `act`.
+"""Loaded policies of a server by name, version and alias.
 
 A store never changes: a new plan makes a new store, and a request finishes with the store it began with.
 """
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from rlservo.export.contract.contract import version_key
-from rlservo.export.contract.errors import StateNeededError, UnknownPolicyError, UnknownVersionError, UsageError
+from rlservo.export.contract.errors import UnknownPolicyError, UnknownVersionError, UsageError
 from rlservo.serve_app.interface import Observation
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.serving_plan import PolicyPlan
@@ -184,33 +184,11 @@ class PolicyStore:
         """Return the policy's shadow, if it has one."""
         return self._find(name).shadow
 
-    def act(
-        self,
-        name: str,
-        version: str | None,
-        obs: Observation,
-        *,
-        explore: bool = False,
-        seed: int | None = None,
-        label: str | None = None,
-    ) -> Decision:
-        """Decide for `obs`: an action for one observation, a batch for a batch.
-
-        Raises UnknownPolicyError, UnknownVersionError and what `Policy.act` raises.
-        """
-        return take_step(self._stateless(name, version, label), obs, explore=explore, seed=seed)[0]
-
     def close(self) -> None:
         """Close every policy."""
         for served in self._served.values():
             for policy in served.versions.values():
                 policy.close()
-
-    def _stateless(self, name: str, version: str | None, label: str | None) -> Policy:
-        policy = self.choose(name, version, label)
-        if policy.is_stateful:  # its recurrent state belongs to one episode, and a server has many callers
-            raise StateNeededError(f"policy '{name}' {NEEDS_STATE if policy.contract.state else NEEDS_LAST}")
-        return policy
 
     def _find(self, name: str) -> _Served:
         served = self._served.get(name)

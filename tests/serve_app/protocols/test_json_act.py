@@ -87,13 +87,13 @@ def test_act_answers_with_the_newest_versions_action(ask: Ask, store: PolicyStor
     assert status == 200
     assert {key: reply[key] for key in ("policy", "version", "seq")} == {"policy": "ur5", "version": "10", "seq": 41}
     assert reply["infer_ms"] > 0
-    np.testing.assert_allclose(reply["action"], store.act("ur5", None, OBS).action, rtol=1e-6)
+    np.testing.assert_allclose(reply["action"], store.get("ur5").act(OBS), rtol=1e-6)
 
 
 def test_a_version_a_batch_and_a_named_observation(ask: Ask, store: PolicyStore) -> None:
     status, _, reply = ask("POST", "/v1/policies/ur5/versions/2/act", {"obs": [OBS, OBS]})
     assert (status, reply["version"], np.shape(reply["action"])) == (200, "2", (2, 6))
-    np.testing.assert_allclose(reply["action"][0], store.act("ur5", "2", OBS).action, rtol=1e-6)
+    np.testing.assert_allclose(reply["action"][0], store.get("ur5", "2").act(OBS), rtol=1e-6)
     named = {f"element_{i}": value for i, value in enumerate(OBS)}
     assert act(ask, {"obs": named})[1]["action"] == act(ask, {"obs": OBS})[1]["action"]
     assert "seq" not in reply

@@ -111,8 +111,8 @@ def test_tritons_own_client_works_unchanged(
         ("gridworld", "1"), ("unsafe", "1"), ("ur5", "1"), ("ur5", "2"), ("ur5", "10")
     ]  # fmt: skip
     assert facts["dtypes"] == ["float32"]
-    expected = store.act("ur5", None, BATCH).action
-    np.testing.assert_array_equal(np.float32(facts["actions"].pop("older")), store.act("ur5", "2", BATCH).action)
+    expected = store.get("ur5").act(BATCH)
+    np.testing.assert_array_equal(np.float32(facts["actions"].pop("older")), store.get("ur5", "2").act(BATCH))
     assert len(facts["actions"]) == 4 + 1 + 4 + 8 + 2
     for name, action in facts["actions"].items():
         np.testing.assert_array_equal(np.float32(action), expected, err_msg=name)
@@ -123,17 +123,17 @@ def test_tritons_own_client_works_unchanged(
 
 
 def test_json_data_may_be_nested_or_flat_and_of_any_number_type(ask: Ask, store: PolicyStore) -> None:
-    expected = store.act("ur5", None, BATCH).action
+    expected = store.get("ur5").act(BATCH)
     flat = infer(ask, request(tensor(BATCH.ravel().tolist(), [33, 27])))[1]
     nested = infer(ask, request(tensor(BATCH.tolist(), [33, 27], "FP64"), id="a"))[1]
     assert flat["outputs"] == nested["outputs"] and nested["id"] == "a" and "id" not in flat
     assert flat["outputs"][0]["datatype"] == "FP32" and flat["outputs"][0]["shape"] == [33, 6]
     np.testing.assert_array_equal(np.float32(flat["outputs"][0]["data"]).reshape(33, 6), expected)
     whole = infer(ask, request(tensor([1] * 27, [1, 27], "INT8")))[1]["outputs"][0]["data"]
-    np.testing.assert_array_equal(np.float32(whole), store.act("ur5", None, np.ones(27, np.float32)).action)
+    np.testing.assert_array_equal(np.float32(whole), store.get("ur5").act(np.ones(27, np.float32)))
     discrete = infer(ask, request(tensor([0, 1, 4], [3], "INT64")), "gridworld")[1]["outputs"][0]
     assert (discrete["datatype"], discrete["shape"]) == ("INT64", [3])
-    assert discrete["data"] == store.act("gridworld", None, [0, 1, 4]).action.tolist()
+    assert discrete["data"] == store.get("gridworld").act([0, 1, 4]).tolist()
 
 
 @pytest.mark.parametrize("pad", range(8))  # so that the tensor begins at every alignment
@@ -159,15 +159,13 @@ def test_binary_tensors_go_in_and_come_out(ask: Ask, store: PolicyStore, pad: in
     (output,) = document["outputs"]
     assert output["parameters"]["binary_data_size"] == len(reply) - length == 33 * 6 * 4 and "data" not in output
     action = np.frombuffer(reply[length:], "<f4").reshape(output["shape"])
-    np.testing.assert_array_equal(action, store.act("ur5", None, BATCH).action)
+    np.testing.assert_array_equal(action, store.get("ur5").act(BATCH))
 
 
 def test_a_body_of_nothing_but_one_tensor_is_read(ask: Ask, store: PolicyStore) -> None:
     status, reply = infer(ask, BATCH.tobytes(), **{LENGTH: "0"})
     assert status == 200 and reply["outputs"][0]["shape"] == [33, 6]
-    np.testing.assert_array_equal(
-        np.float32(reply["outputs"][0]["data"]).reshape(33, 6), store.act("ur5", None, BATCH).action
-    )
+    np.testing.assert_array_equal(np.float32(reply["outputs"][0]["data"]).reshape(33, 6), store.get("ur5").act(BATCH))
     status, reply = infer(ask, BATCH.tobytes()[:-1], **{LENGTH: "0"})
     assert status == 422 and "108 bytes per observation, but the body has 3563" in reply["error"]
 

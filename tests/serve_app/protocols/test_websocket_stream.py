@@ -105,7 +105,7 @@ def port(store: PolicyStore, served: Serve) -> Iterator[int]:
 
 
 def expected(store: PolicyStore, obs: Any = OBS, name: str = "ur5", version: str | None = None) -> NDArray[Any]:
-    return store.act(name, version, obs).action
+    return store.get(name, version).act(obs)
 
 
 def test_an_openpi_client_at_the_root_gets_metadata_and_actions(port: int, store: PolicyStore) -> None:

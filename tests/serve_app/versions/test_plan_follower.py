@@ -299,7 +299,7 @@ def test_the_same_version_is_the_same_bundle_in_every_process(
         await fleet.deploy(document)
         store = fleet.controls[0].store
         assert store is not None
-        action = store.act("ur5", "2", OBS).action
+        action = store.get("ur5", "2").act(OBS)
         shutil.rmtree(folder / "ur5" / "2")
         shutil.move(box_policy(tmp_path / "again", version="2", seed=9), folder / "ur5" / "2")
         restarted = fleet.start(folder, "restarted")  # its default is there; the exchanged version is not served
@@ -360,7 +360,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
         while not began.is_set():
             await asyncio.sleep(0.01)
         assert control.states()["ur5"]["2"].state == "loading"
-        assert control.store is not None and control.store.act("ur5", None, OBS).version == "1"
+        assert control.store is not None and control.store.default("ur5") == "1"
         go_on.set()
         await change
         assert control.states()["ur5"]["2"].state == "ready" and control.store.versions("ur5") == ("1", "2")

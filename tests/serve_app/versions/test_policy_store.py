@@ -17,6 +17,7 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions.policy_store import take_step
 from stores import load_store
 
 OBS = np.zeros(27, np.float32) + 0.1
@@ -26,10 +27,10 @@ def test_the_newest_version_by_number_is_the_default(policies: Path) -> None:
     store = load_store(policies)
     assert store.names == ("gridworld", "ur5")
     assert store.versions("ur5") == ("1", "2", "10")
-    newest = store.act("ur5", None, OBS)
+    newest, _ = take_step(store.get("ur5"), OBS)
     assert (newest.name, newest.version) == ("ur5", "10")
     np.testing.assert_array_equal(newest.action, Policy.load(policies / "ur5" / "10").act(OBS))
-    np.testing.assert_array_equal(store.act("ur5", "2", OBS).action, Policy.load(policies / "ur5" / "2").act(OBS))
+    np.testing.assert_array_equal(store.get("ur5", "2").act(OBS), Policy.load(policies / "ur5" / "2").act(OBS))
     assert 0 < newest.infer_ms < 1000
 
 
@@ -41,11 +42,11 @@ def test_a_bundle_a_policy_folder_and_a_repository_load_and_repeats_count_once(p
 def test_unknown_names_and_versions_say_what_there_is(policies: Path) -> None:
     store = load_store(policies)
     with pytest.raises(UnknownPolicyError, match="no policy 'ur6' is loaded: this server has gridworld, ur5"):
-        store.act("ur6", None, OBS)
+        store.get("ur6")
     with pytest.raises(UnknownVersionError, match="no version '3': expected one of 1, 2, 10"):
-        store.act("ur5", "3", OBS)
+        store.get("ur5", "3")
     with pytest.raises(UnknownVersionError):
-        store.act("ur5", "../../etc", OBS)
+        store.get("ur5", "../../etc")
 
 
 def test_two_bundles_of_the_same_name_and_version_are_refused_and_a_copy_counts_once(
