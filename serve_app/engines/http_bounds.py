@@ -9,7 +9,6 @@ methods of `asyncio.Protocol`, callbacks of httptools' parser and uvicorn's fram
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 import time
 from collections.abc import Awaitable, Iterable
@@ -20,8 +19,9 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from uvicorn.server import ServerState
 
-from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError
+from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError, RlservoError
 from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, error_answer, send_reply
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send
@@ -38,12 +38,6 @@ LINGER_S = 5.0  # [s] for which a refused client's further data is read and drop
 MAX_UNANSWERED = 64  # messages of a WebSocket
 MAX_FRAMES = 1000  # pings, pongs and fragments of a WebSocket per second
 VIOLATION = 1008  # WebSocket's close code for a client that violates the server's rules
-ERROR_CODES = {
-    400: RequestError.code,
-    408: DeadlineError.code,
-    429: OverloadedError.code,
-    431: RequestError.code,
-}
 CHECK_S = 1.0  # [s] between two checks of a connection's phase
 
 
@@ -55,10 +49,11 @@ class ConnectionLimits:
         self.body_s = settings.body_timeout_s
         self._handler = handler
 
-    def record(self, status: int, sentence: str, peer: str | None) -> None:
-        """Count and log a request that was refused before the application got it."""
-        request = Request("http", "", None, time.perf_counter(), peer=peer)
-        self._handler.record_failure(request, ERROR_CODES[status], sentence)
+    def refuse(self, error: RlservoError, client: tuple[str, int] | None) -> tuple[int, bytes]:
+        """Return (status, body) for a request that the application does not get; count and log it."""
+        request = Request("http", "", None, time.perf_counter(), peer=client and client[0])
+        self._handler.record_failure(request, error.code, error.message)
+        return error_answer(error)[:2]
 
 
 class _Refused(Exception):
@@ -125,7 +120,7 @@ class BoundedHttp(HttpToolsProtocol):
         if not self._in_body and self._phase_limit_s is not None:
             self._head_bytes += len(data)
             if self._head_bytes > MAX_HEAD_BYTES and not self.transport.is_closing():
-                self._end(431, f"the request's headers are larger than {MAX_HEAD_BYTES} bytes")
+                self._end(RequestError(f"the request's headers are larger than {MAX_HEAD_BYTES} bytes"), 431)
 
     # Callbacks of the parser
 
@@ -164,7 +159,7 @@ class BoundedHttp(HttpToolsProtocol):
 
     def send_400_response(self, msg: str) -> None:  # noqa: ARG002
         """Answer a request that the parser or one of its callbacks refused, and close."""
-        self._end(400, self._sentence or "the request is not valid HTTP/1.1")
+        self._end(RequestError(self._sentence or "the request is not valid HTTP/1.1"))
 
     # Ours
 
@@ -180,7 +175,7 @@ class BoundedHttp(HttpToolsProtocol):
         elif self.cycle is not None and self._in_body and self.cycle.response_started:
             self.transport.abort()  # it was answered, and the rest of its body never came
         else:
-            self._end(408, f"the request did not arrive within {self._phase_limit_s:g} s")
+            self._end(DeadlineError(f"the request did not arrive within {self._phase_limit_s:g} s"))
 
     def _stop_checks(self) -> None:
         if self._check_timer is not None:
@@ -199,24 +194,23 @@ class BoundedHttp(HttpToolsProtocol):
         self._sentence = sentence
         raise _Refused
 
-    def _end(self, status: int, sentence: str) -> None:
+    def _end(self, error: RlservoError, other_status: int | None = None) -> None:
         """Answer with an error in place of the application, and close the connection."""
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.disconnected = True  # a later reply of the application is dropped
             self.cycle.message_event.set()
-        self._limits.record(status, sentence, self.client and self.client[0])
-        content = _encode(status, sentence)
+        status, content = self._limits.refuse(error, self.client)
         self.transport.write(
             b"HTTP/1.1 %d \r\ncontent-type: application/json\r\nconnection: close\r\ncontent-length: %d\r\n\r\n%s"
-            % (status, len(content), content)
+            % (other_status or status, len(content), content)
         )
         self.transport.close()
 
     def _refuse_connection(self, _scope: Scope, _receive: Receive, send: Send) -> Awaitable[None]:
         count = self._limits.per_address
         sentence = f"your address has more than {count} connections, or all clients have {MAX_CONNECTIONS}: close some"
-        self._limits.record(429, sentence, self.client and self.client[0])
-        return _answer(send, 429, _encode(429, sentence))
+        _, content = self._limits.refuse(OverloadedError(sentence), self.client)
+        return send_reply(send, 429, content, (*JSON_HEADERS, (b"retry-after", b"1"), (b"connection", b"close")))
 
 
 class BoundedWebSocket(WebSocketsSansIOProtocol):
@@ -289,18 +283,3 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
             return
         self.conn.fail(VIOLATION, reason)
         self.handle_parser_exception()
-
-
-async def _answer(send: Send, status: int, content: bytes) -> None:
-    headers = [
-        (b"content-type", b"application/json"),
-        (b"content-length", b"%d" % len(content)),
-        (b"retry-after", b"1"),
-        (b"connection", b"close"),
-    ]
-    await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": content})
-
-
-def _encode(status: int, sentence: str) -> bytes:
-    return json.dumps({"error": sentence, "code": ERROR_CODES[status]}, separators=(",", ":")).encode()

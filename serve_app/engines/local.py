@@ -133,7 +133,10 @@ def serve_policies(
 
 @dataclass
 class EmbeddedServer:
-    """Factory of the application, which is pickled for the workers; uvicorn calls it in the process that serves."""
+    """The application with its lifespan: policies are loaded and gRPC listens before the first connection.
+
+    It is pickled for the workers before it starts.
+    """
 
     places: tuple[str, ...]
     host: str
@@ -144,17 +147,57 @@ class EmbeddedServer:
     failure: RlservoError | None = None
     """Reason why the start failed, in the process that serves."""
     policies: tuple[tuple[str, str], ...] = ()
+    app: ASGIApp | None = None
+    """The application, once it has started."""
 
-    def __call__(self) -> ASGIApp:
-        """Return the application, in the process that serves it."""
-        return _Application(self)
+    def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
+        """Handle one connection, or first the server's own start and stop."""
+        return (self.app or self._live)(scope, receive, send)
 
-    def config(self, **options: Any) -> uvicorn.Config:
+    async def _live(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await receive()
+        is_worker = self.workers > 1
+        try:
+            async with contextlib.AsyncExitStack() as stack:
+                await self._start(stack, scope["state"], is_worker=is_worker)
+                await send({"type": "lifespan.startup.complete"})
+                await receive()
+        except RlservoError as error:
+            self.failure = error
+            if is_worker:
+                logger.error("a worker could not start: %s", error.message)
+            await send({"type": "lifespan.startup.failed", "message": ""})
+            return
+        await send({"type": "lifespan.shutdown.complete"})
+
+    async def _start(self, stack: contextlib.AsyncExitStack, state: dict[str, Any], *, is_worker: bool) -> None:
+        settings, replica = self.settings, str(os.getpid()) if is_worker else ""
+        if is_worker:
+            configure(settings, replica=replica)
+            _stop_with_parent()
+        serving = Serving(self.places, settings, replica=replica, host=self.host, is_alone=not is_worker)
+        stack.push_async_callback(serving.stop)
+        await serving.start(self.served)
+        store = serving.handler.store()
+        if settings.default_policy not in (None, *store.names):
+            raise UsageError(
+                f"the default policy '{settings.default_policy}' is not served: expected {', '.join(store.names)}"
+            )
+        self.policies = tuple((name, store.default(name)) for name in store.names)
+        if self.grpc_port is not None:
+            from rlservo.serve_app.engines.grpc_server import GrpcServer  # takes a quarter of the start
+
+            grpc = GrpcServer(serving.handler, self.host, self.grpc_port, is_shared=is_worker)
+            await grpc.start()
+            stack.push_async_callback(grpc.stop)
+        state[LIMITS] = ConnectionLimits(settings, serving.handler)
+        self.app = serving.app
+
+    def config(self) -> uvicorn.Config:
         """Return uvicorn's configuration."""
         trusted = self.settings.trusted_proxies
         return uvicorn.Config(
             self,
-            factory=True,
             interface="asgi3",
             http=BoundedHttp,
             ws=BoundedWebSocket,
@@ -171,71 +214,7 @@ class EmbeddedServer:
             timeout_worker_healthcheck=HUNG_S,
             ws_max_size=self.settings.max_body_bytes,
             ws_per_message_deflate=False,  # for messages of kilobytes it costs more than it saves
-            **options,
         )
-
-
-class _Application:
-    """The application with its lifespan: policies are loaded and gRPC listens before the first connection."""
-
-    def __init__(self, server: EmbeddedServer) -> None:
-        self._server = server
-        self._is_worker = server.workers > 1
-        replica = str(os.getpid()) if self._is_worker else ""
-        if self._is_worker:
-            configure(server.settings, replica=replica)
-        self._serving: Serving | None = None
-        self._grpc: Any = None
-        self._replica = replica
-        self._app: ASGIApp | None = None
-
-    def __call__(self, scope: Scope, receive: Receive, send: Send) -> Awaitable[None]:
-        """Handle one connection, or the server's own start and stop."""
-        app = self._live if self._app is None or scope["type"] == "lifespan" else self._app
-        return app(scope, receive, send)
-
-    async def _live(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await receive()
-        try:
-            await self._start(scope["state"])
-        except RlservoError as error:
-            self._server.failure = error
-            if self._is_worker:
-                logger.error("a worker could not start: %s", error.message)
-            await send({"type": "lifespan.startup.failed", "message": ""})
-            return
-        await send({"type": "lifespan.startup.complete"})
-        await receive()
-        await self._stop()
-        await send({"type": "lifespan.shutdown.complete"})
-
-    async def _start(self, state: dict[str, Any]) -> None:
-        server, settings = self._server, self._server.settings
-        if self._is_worker:
-            _stop_with_parent()
-        serving = Serving(
-            server.places, settings, replica=self._replica, host=server.host, is_alone=not self._is_worker
-        )
-        await serving.start(server.served)
-        store = serving.handler.store()
-        if settings.default_policy not in (None, *store.names):
-            raise UsageError(
-                f"the default policy '{settings.default_policy}' is not served: expected {', '.join(store.names)}"
-            )
-        server.policies = tuple((name, store.default(name)) for name in store.names)
-        if server.grpc_port is not None:
-            from rlservo.serve_app.engines.grpc_server import GrpcServer  # takes a quarter of the start
-
-            self._grpc = GrpcServer(serving.handler, server.host, server.grpc_port, is_shared=self._is_worker)
-            await self._grpc.start()
-        state[LIMITS] = ConnectionLimits(settings, serving.handler)
-        self._serving, self._app = serving, serving.app
-
-    async def _stop(self) -> None:
-        if self._grpc is not None:
-            await self._grpc.stop()
-        if self._serving is not None:
-            await self._serving.stop()
 
 
 def _stop_with_parent() -> None:
@@ -254,13 +233,21 @@ def _stop_with_parent() -> None:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server, which reports when it is ready and when it begins to stop."""
+    """uvicorn's server, which reports when it is ready and when it begins to stop, and stops on an event."""
 
     def __init__(
-        self, config: uvicorn.Config, on_ready: Callable[[], None], on_stop: Callable[[], None] | None
+        self,
+        config: uvicorn.Config,
+        on_ready: Callable[[], None],
+        on_stop: Callable[[], None] | None,
+        stop: threading.Event | None,
     ) -> None:
         super().__init__(config)
-        self._on_ready, self._on_stop = on_ready, on_stop
+        self._on_ready, self._on_stop, self._stop = on_ready, on_stop, stop
+
+    async def on_tick(self, counter: int) -> bool:
+        """Return whether to stop."""
+        return await super().on_tick(counter) or (self._stop is not None and self._stop.is_set())
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Load the policies and listen."""
@@ -283,14 +270,10 @@ def _run_here(
     stop: threading.Event | None,
     in_main: bool,
 ) -> None:
-    running = _Server(server.config(), lambda: ready(server.policies), on_stop)
-
-    def request_stop() -> None:
-        running.should_exit = True
-
+    running = _Server(server.config(), lambda: ready(server.policies), on_stop, stop)
     configure(server.settings)
     UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
-    with _stop_signals(request_stop) if in_main else contextlib.nullcontext(), _stop_event(stop, request_stop):
+    with _stop_signals(lambda: setattr(running, "should_exit", True)) if in_main else contextlib.nullcontext():
         try:
             running.run(sockets=[listener])
         except SystemExit:
@@ -378,28 +361,6 @@ def _stop_signals(request_stop: Callable[[], None]) -> Iterator[None]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _stop_event(stop: threading.Event | None, request_stop: Callable[[], None]) -> Iterator[None]:
-    if stop is None:
-        yield
-        return
-    ended = threading.Event()
-
-    def wait() -> None:
-        while not ended.is_set():
-            if stop.wait(0.1):
-                request_stop()
-                return
-
-    waiter = threading.Thread(target=wait, daemon=True)
-    waiter.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        waiter.join()
 
 
 def _raise_descriptor_limit() -> None:
