@@ -12,8 +12,8 @@ from mkdocs.plugins import event_priority
 
 import rlservo
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.docs_page import files_of_swagger_ui
 from rlservo.serve_app.protocols.openapi import openapi
+from rlservo.serve_app.protocols.pages import files_of_swagger_ui
 from rlservo.serve_app.server.settings import ServerSettings
 
 SECTIONS = {"tutorial": "Tutorial", "how-to": "How-to", "reference": "Reference", "explanation": "Explanation"}

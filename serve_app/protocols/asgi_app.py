@@ -6,12 +6,11 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from rlservo.serve_app.protocols import (
     admin_routes,
-    docs_page,
     json_codec,
     oip_infer,
     oip_models,
+    pages,
     recording_routes,
-    status_page,
     websocket_stream,
 )
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
@@ -50,8 +49,7 @@ def create_app(
         *((*admin_routes.routes(handler, control), *recording_routes.routes(handler)) if control is not None else ()),
         *oip_infer.routes(handler),
         *oip_models.routes(handler),
-        *status_page.routes(),
-        *docs_page.routes(lambda: table),
+        *pages.routes(lambda: table),
     ]
     table = RoutingTable(routes)
     return PolicyApp(handler, checks, table, is_behind_serve=is_behind_serve)

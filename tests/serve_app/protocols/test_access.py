@@ -22,11 +22,10 @@ from typing import Any, BinaryIO
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.protocols import docs_page
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.pages import FOLDER, SWAGGER_FILES
 from rlservo.serve_app.protocols.routes import WEBSOCKET
-from rlservo.serve_app.protocols.status_page import FOLDER
 from rlservo.serve_app.server.api_keys import Access, new_key
 from rlservo.serve_app.server.logs import FIELDS, configure
 from rlservo.serve_app.server.settings import ServerSettings
@@ -233,8 +232,8 @@ def test_only_probes_and_the_page_are_open_and_only_admins_administer(app: Polic
     levels = {(route.path, route.access) for route in app.table.routes}
     assert {path for path, access in levels if access is Access.admin} == set(ADMIN_PATHS)
     opened = {path for path, access in levels if access is Access.open}
-    page = {f"/page/{file.name}" for file in FOLDER.iterdir() if file.name != "index.html"}
-    docs = {"/openapi.json", "/docs", *(f"/docs/{name}" for name in docs_page.FILES)}
+    page = {f"/page/{file.name}" for file in FOLDER.iterdir() if file.suffix != ".html"}
+    docs = {"/openapi.json", "/docs", *(f"/docs/{name}" for name in SWAGGER_FILES)}
     assert opened == {"/", "/healthz", "/v2/health/live", "/v2/health/ready", *page, *docs}
     assert ("/", Access.act) in levels  # the stream; the page is another route, for GET alone
 

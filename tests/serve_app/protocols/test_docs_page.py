@@ -14,7 +14,7 @@ import pytest
 
 from browser import Browser
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.docs_page import PAGE
+from rlservo.serve_app.protocols.pages import FOLDER
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import load_store
 
@@ -23,8 +23,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:
 
 
 def test_the_page_names_no_other_host() -> None:
-    addresses = re.findall(r'(?:src|href|url)[=:]\s*"([^"]*)"', PAGE)
-    assert len(addresses) == 4
+    page = (FOLDER / "docs.html").read_text() + (FOLDER / "docs.js").read_text()
+    addresses = re.findall(r'(?:src|href|url)[=:]\s*"([^"]*)"', page)
+    assert len(addresses) == 5
     assert not [address for address in addresses if address.startswith(("/", "http"))]
 
 

@@ -22,7 +22,7 @@ from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.spaces import BoxSpec, Element
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.status_page import FOLDER
+from rlservo.serve_app.protocols.pages import FOLDER
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import SetAlias
