@@ -16,7 +16,6 @@ import asyncio
 import contextlib
 import json
 import logging
-import sys
 import time
 from collections.abc import Mapping
 
@@ -99,20 +98,12 @@ class StreamEndpoint:
         except OverloadedError as error:
             await fail_stream(send, error_answer(error)[1])
             return
-        idle = IdleTimer(handler.settings.stream_idle_s)
         opening.stream = Session(policy) if policy.is_stateful else None
+        conversation = _Conversation(handler, self._codec, opening, scope, send)
         try:
             await send(_binary(encode_metadata(policy.contract)))
-            conversation = _Conversation(handler, self._codec, opening, scope, idle)
-            while (message := await receive())["type"] != "websocket.disconnect":
+            while (message := await receive())["type"] != "websocket.disconnect" and not conversation.is_idle:
                 await send(await conversation.answer(message))
-        except asyncio.CancelledError:
-            if not idle.expired:
-                raise
-            if sys.version_info >= (3, 11) and (task := asyncio.current_task()) is not None:
-                task.uncancel()  # Python counts cancellations
-            handler.record_failure(opening, IDLE, SILENT)
-            await _close_idle(send)
         except RlservoError as error:
             await fail_stream(send, error_answer(error)[1])
         except OSError:  # the client disconnected while its reply was being sent
@@ -121,7 +112,7 @@ class StreamEndpoint:
             handler.record_bug(opening)
             await fail_stream(send, error_answer(InternalError(BUG))[1])
         finally:
-            idle.stop()
+            conversation.timer.cancel()
             if opening.stream is not None:
                 handler.episodes.sessions.release(opening.stream)
             handler.close_stream(opening)
@@ -142,16 +133,36 @@ class StreamEndpoint:
 
 
 class _Conversation:
-    """Answers the messages of one connection in sequence."""
+    """Answers the messages of one connection in sequence, and closes it if there are none."""
 
     def __init__(
-        self, handler: RequestHandler, codec: MsgpackCodec, opening: Request, scope: Scope, idle: IdleTimer
+        self, handler: RequestHandler, codec: MsgpackCodec, opening: Request, scope: Scope, send: Send
     ) -> None:
-        self._handler, self._codec, self._opening, self._idle = handler, codec, opening, idle
+        self._handler, self._codec, self._opening, self._send = handler, codec, opening, send
         self._keeps = KEEP in scope.get("query_string", b"").split(b"&")
         self._key = StreamKey(handler.keys, presented_key(scope[HEADERS]))
         self._timings: dict[str, float] | None = None
         self._is_fresh = False
+        self._last = time.perf_counter()
+        self.is_idle = False
+        self.timer = self._check_after(handler.settings.stream_idle_s)
+
+    def _check_after(self, seconds: float) -> asyncio.TimerHandle:
+        """Look again after some time: one callback for each period of silence, not one for each message."""
+        return asyncio.get_running_loop().call_later(seconds, self._check)
+
+    def _check(self) -> None:
+        left_s = self._last + self._handler.settings.stream_idle_s - time.perf_counter()
+        if left_s > 0:
+            self.timer = self._check_after(left_s)
+            return
+        self.is_idle = True
+        self._handler.record_failure(self._opening, IDLE, SILENT)
+        self._closing = asyncio.create_task(self._close())  # after which the server reports a disconnect
+
+    async def _close(self) -> None:
+        with contextlib.suppress(OSError, RuntimeError):  # the client may have disconnected
+            await self._send({"type": "websocket.close", "code": GOING_AWAY, "reason": SILENT})
 
     async def answer(self, message: Message) -> Message:
         """Return the reply. Raises RlservoError, which has been recorded, if it ends the stream."""
@@ -168,7 +179,7 @@ class _Conversation:
             stream_id=opening.stream_id,
             reply_options=self._timings,
         )
-        self._idle.touch()
+        self._last = request.received
         self._is_fresh = False
         try:
             reply = await handler.answer(self._codec, request, message, self._key)
@@ -183,45 +194,11 @@ class _Conversation:
         return _binary(reply)
 
 
-class IdleTimer:
-    """Cancels the task that created it after a period of inactivity: one callback per period, not a timer per wait."""
-
-    def __init__(self, seconds: float) -> None:
-        """Start the clock for the current task."""
-        self._seconds = seconds
-        self._task = asyncio.current_task()
-        self._loop = asyncio.get_running_loop()
-        self._touched = self._loop.time()
-        self._handle = self._loop.call_later(seconds, self._check)
-        self.expired = False
-
-    def touch(self) -> None:
-        """Restart the period."""
-        self._touched = self._loop.time()
-
-    def stop(self) -> None:
-        """Stop the timer: the task is not cancelled any more."""
-        self._handle.cancel()
-
-    def _check(self) -> None:
-        left = self._touched + self._seconds - self._loop.time()
-        if left > 0:
-            self._handle = self._loop.call_later(left, self._check)
-        elif self._task is not None:
-            self.expired = True
-            self._task.cancel()
-
-
 def _with_seq(content: bytes, seq: int | None) -> str:
     """Return an error's body with its request's number."""
     if seq is None:
         return content.decode()
     return encode_json({**json.loads(content), "seq": seq}).decode()
-
-
-async def _close_idle(send: Send) -> None:
-    with contextlib.suppress(OSError, RuntimeError):  # the client may have disconnected
-        await send({"type": "websocket.close", "code": GOING_AWAY, "reason": SILENT})
 
 
 def _binary(content: bytes) -> Message:
