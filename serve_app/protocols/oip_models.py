@@ -55,7 +55,16 @@ STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
 BACKEND = "onnxruntime"
 LARGEST_INT32 = 2**31 - 1
 NOTHING = {"count": 0, "ns": 0}
-INDEX: TypeAdapter[Any] = TypeAdapter(strict(TypedDict("IndexFilter", {"ready": bool | None}, total=False)))
+
+
+@strict
+class IndexFilter(TypedDict, total=False):
+    """Body of a request for the repository index."""
+
+    ready: bool | None
+
+
+INDEX: TypeAdapter[IndexFilter] = TypeAdapter(IndexFilter)
 
 
 def routes(handler: RequestHandler) -> list[Route]:

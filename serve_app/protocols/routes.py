@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
 from rlservo.serve_app.protocols.http_errors import Headers
-from rlservo.serve_app.server.access_checks import PATH
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.wire.asgi import ASGIApp
 
 GET, POST = "GET", "POST"
 WEBSOCKET = "WebSocket:"  # not a method that a client can send: those have no colon
-PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
+PATHS_REMEMBERED = 1024
 PARAMETER = re.compile(r"\\{(\w+)\\}")  # in an escaped path
 
 
@@ -77,7 +77,7 @@ class RoutingTable:
         self._patterns = [
             (re.compile(PARAMETER.sub(r"(?P<\1>[^/]+)", re.escape(each.path))), each) for each in self.routes
         ]
-        self._remembered: dict[tuple[str, str], Found] = {}
+        self._find = functools.lru_cache(PATHS_REMEMBERED)(self._look_up)
 
     def find(self, method: str, path: str, accept: bytes) -> Found:
         """Return the route of a connection with this `Accept` header.
@@ -86,10 +86,9 @@ class RoutingTable:
         """
         if method == "HEAD":  # the engine leaves out its reply's body
             method = GET
-        known = self._remembered.get((method, path))
-        if known is not None:
-            return known
-        wants_page = method == GET and b"text/html" in accept.lower() and b"json" not in accept
+        return self._find(method, path, method == GET and b"text/html" in accept.lower() and b"json" not in accept)
+
+    def _look_up(self, method: str, path: str, wants_page: bool) -> Found:
         others: list[Route] = []
         for pattern, route in self._patterns:
             match = pattern.fullmatch(path)
@@ -98,12 +97,7 @@ class RoutingTable:
             if route.is_page and not wants_page:
                 continue
             if route.method == method:
-                found = Found(route, route.access, match.groupdict())
-                if route.app is not None and len(path) <= LONGEST_REMEMBERED and PATH.fullmatch(path) is not None:
-                    if len(self._remembered) >= PATHS_REMEMBERED:
-                        self._remembered.clear()
-                    self._remembered[method, path] = found
-                return found
+                return Found(route, route.access, match.groupdict())
             others.append(route)
         levels = {route.access for route in others} or {Access.act}
         access = next(level for level in (Access.admin, Access.act, Access.open) if level in levels)

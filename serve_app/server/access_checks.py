@@ -10,6 +10,7 @@ Sources: Fetch Standard, section 3.1 (Origin); W3C Fetch Metadata Request Header
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import hmac
 import ipaddress
@@ -67,21 +68,13 @@ class Hosts:
         self._names = names | {"localhost", listening_on.strip("[]").lower()}
         if not self._local:
             self._names |= {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
-        self._seen: dict[bytes, bool] = {}
+        self.permit = functools.lru_cache(HOSTS_REMEMBERED)(self._permit)
+        """Returns whether a request with this `Host` is for this server."""
 
-    def permit(self, host: bytes) -> bool:
-        """Return whether a request with this `Host` is for this server."""
-        permitted = self._seen.get(host)
-        if permitted is None:
-            if len(self._seen) >= HOSTS_REMEMBERED:
-                self._seen.clear()
-            permitted = self._seen[host] = self._any or self._is_ours(host.decode("latin-1").lower())
-        return permitted
-
-    def _is_ours(self, host: str) -> bool:
-        match = HOST.fullmatch(host)
-        if match is None:
-            return False
+    def _permit(self, host: bytes) -> bool:
+        match = HOST.fullmatch(host.decode("latin-1").lower())
+        if match is None or self._any:
+            return self._any
         name = match["name"].strip("[]")
         if name in self._names:
             return True
