@@ -6,13 +6,14 @@ The file's place follows from the port, so that `rlservo policy` on the same mac
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.server.api_keys import new_key
+from rlservo.serve_app.wire.admin_key_file import read_key
 
 logger = logging.getLogger(__name__)
 
@@ -23,31 +24,21 @@ def operator_key(file: Path) -> Iterator[str]:
 
     Yields its `sha256:<hash>`, or '' if the file cannot be written, which is logged.
     """
-    key, _ = new_key("operator", admin=True)
-    digest = digest_of(key)
+    key, line = new_key("operator", admin=True)
     try:
-        try:
-            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            file.unlink(missing_ok=True)  # of a server that was killed
-            # Must be a new file: a file or link that another user put there is not used.
-            descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
-            with os.fdopen(descriptor, "w") as stream:
-                stream.write(key + "\n")
-        except OSError as error:
-            logger.warning("no admin key for 'rlservo policy': %s cannot be written (%s)", file, error.strerror)
-            digest = ""
-        yield digest
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)  # of a server that was killed
+        # Must be a new file: a file or link that another user put there is not used.
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        with os.fdopen(descriptor, "w") as stream:
+            stream.write(key + "\n")
+    except OSError as error:
+        logger.warning("no admin key for 'rlservo policy': %s cannot be written (%s)", file, error.strerror)
+        yield ""
+        return
+    try:
+        yield line.split()[-1]
     finally:
-        remove_key(file, digest_of(key))
-
-
-def digest_of(key: str) -> str:
-    """Return `sha256:<hash>` of a key."""
-    return f"sha256:{hashlib.sha256(key.encode()).hexdigest()}"
-
-
-def remove_key(file: Path, digest: str) -> None:
-    """Remove the key file if its key has this digest; the file of a later server stays."""
-    with contextlib.suppress(OSError, UnicodeDecodeError):
-        if digest_of(file.read_text(encoding="ascii").strip()) == digest:
-            file.unlink()
+        with contextlib.suppress(UsageError, OSError):
+            if read_key(file) == key:  # not that of a later server
+                file.unlink()
