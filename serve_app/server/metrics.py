@@ -58,18 +58,16 @@ class Totals:
     last_answer_ms: int  # since 1970; 0 if there was none
 
 
+@dataclass(slots=True)
 class Answers:
     """Answered requests to one version of a policy over one protocol."""
 
-    __slots__ = ("batch", "count", "inference", "last_s", "latency", "observations")
-
-    def __init__(self, latency: Histogram, inference: Histogram, batch: Histogram) -> None:
-        self.latency = latency
-        self.inference = inference
-        self.batch = batch
-        self.count = 0
-        self.observations = 0
-        self.last_s = 0.0  # since 1970
+    latency: Histogram
+    inference: Histogram
+    batch: Histogram
+    count: int = 0
+    observations: int = 0
+    last_s: float = 0.0  # since 1970
 
 
 class Metrics(Collector):
@@ -111,8 +109,9 @@ class Metrics(Collector):
         answers = self.answers.get(key)
         if answers is None:
             labels = (self._replica, *key)
-            histograms = (self._latency, self._inference, self._batch)
-            answers = self.answers[key] = Answers(*(histogram.labels(*labels) for histogram in histograms))
+            latency, inference, batch = self._latency, self._inference, self._batch
+            answers = Answers(latency.labels(*labels), inference.labels(*labels), batch.labels(*labels))
+            self.answers[key] = answers
         answers.latency.observe(seconds)
         answers.inference.observe(decision.infer_ms / 1e3)
         if decision.batch is not None:
