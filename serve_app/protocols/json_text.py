@@ -18,6 +18,7 @@ def parse_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[d
 
     Raises RequestError.
     """
+    document: Any = None
     non_finite = False
     try:
         document = orjson.loads(body)

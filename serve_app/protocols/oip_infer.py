@@ -289,8 +289,8 @@ def _episode(
     states: dict[str, Any] = {
         name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
     }
-    if states and parameters.get("state_policy") is not None:
-        states[BELONGS_TO] = parameters["state_policy"]
+    if states and (belongs_to := parameters.get("state_policy")) is not None:
+        states[BELONGS_TO] = belongs_to
     sequence, starts = parameters.get("sequence_id") or None, bool(parameters.get("sequence_start"))
     episode = replace(
         outcome,
