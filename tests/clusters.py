@@ -1,4 +1,4 @@
-"""A Ray cluster as an operator runs one: the shipped configuration, `serve deploy`, an admin key; two replicas."""
+"""A Ray cluster as an operator runs one: the shipped configuration, an admin key; two replicas."""
 
 from __future__ import annotations
 
@@ -65,27 +65,15 @@ class Cluster:
     def application(self) -> dict[str, Any]:
         return self.configuration["applications"][0]  # type: ignore[no-any-return]
 
-    def deploy(
-        self,
-        user_config: dict[str, Any] | None = None,
-        settings: dict[str, Any] | None = None,
-        *,
-        by_command: bool = False,
-    ) -> None:
-        """`serve deploy` with these changes to the file, or the request that it sends; returns when Serve took it."""
+    def deploy(self, user_config: dict[str, Any] | None = None, settings: dict[str, Any] | None = None) -> None:
+        """Send the request of `serve deploy` with these changes to the file; returns when Serve took it."""
         if user_config is not None:
             deployment = {"name": "PolicyServer", "user_config": user_config, "graceful_shutdown_timeout_s": PATIENCE_S}
             self.application["deployments"] = [deployment]
         if settings is not None:
             self.application["args"]["settings"] = {**self.application["args"]["settings"], **settings}
-        if not by_command:  # starting the command costs ten seconds on a busy machine
-            status, content = self._ask_dashboard("PUT", json.dumps(self.configuration))
-            assert status == 200, content
-            return
-        file = self.folder / "serve.yaml"
-        file.write_text(yaml.safe_dump(self.configuration))
-        done = self.run("ray.serve.scripts", "deploy", file, "-a", f"http://127.0.0.1:{self.dashboard}")
-        assert done.returncode == 0, done.stdout + done.stderr
+        status, content = self._ask_dashboard("PUT", json.dumps(self.configuration))
+        assert status == 200, content
 
     def run(self, *words: object, **variables: str) -> subprocess.CompletedProcess[str]:
         """Run a Python module as an operator does on this node."""
@@ -180,7 +168,7 @@ def own_ports(folder: Path) -> dict[str, str]:
 
 @pytest.fixture(scope="session")
 def cluster(cluster_repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
-    """The cluster, with two replicas, version 1 of ur5 deployed by `serve deploy`, and sessions in Redis."""
+    """The cluster, with two replicas, version 1 of ur5 deployed, and sessions in Redis."""
     with running_redis() as redis, _cluster(cluster_repository, tmp_path_factory, redis) as made:
         yield made
 
@@ -216,7 +204,7 @@ def _cluster(
             address, port, grpc_port, dashboard, folder, environment, cluster_repository, configuration,
             psutil.Process(process.pid),
         )  # fmt: skip
-        made.deploy(serving("1"), by_command=True)
+        made.deploy(serving("1"))
         made.wait_for_status("RUNNING")
         yield made
     finally:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,25 +14,35 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import pytest
 import typer
 
 from rlservo.deploy.cli import app
 from servers import free_ports
+from trainings import OneRay
 
 ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+TUTORIAL = ROOT / "docs" / "tutorial" / "first-robot.md"
+HOW_TO = ROOT / "docs" / "how-to"
 BLOCK = re.compile(
     r"^(<!-- not run: [^\n]+ -->\n)?( *)(?:<!-- not run: ([^\n]+) -->\n *)?```(\w+)\n(.*?)^ *```$", re.M | re.S
 )
 STAYS = re.compile(  # until Ctrl-C
-    r"^(?:\w+=\S+ )*rlservo "
+    r"^(?:\w+=\S+ )*(?:(?=serve run)|rlservo )"
     r"(serve|cockpit|server-manager|robot-server|ur-controller|ros2-sim|ros2|learn|policy promote)\b(?!.*&\s*$)"
 )
-BEGUN = {"learn": "is the checkpoint itself", "policy promote": "watching version", "ros2": " -> stopped"}
+BEGUN = {
+    "serve": "Ctrl-C|Submitted deploy config",
+    "learn": "is the checkpoint itself",
+    "policy promote": "watching version",
+    "ros2": " -> stopped",
+}
 """What such a command prints when it has begun; the others invite to press Ctrl-C."""
+RAY_GAVE_UP = "The current node timed out during startup"  # on a busy machine, after its 30 s (ray 2.60): tried again
 QUESTION = "[y/N] "
 NOT_HERE = re.compile(r"^(pip install|make) ")  # tests/test_wheel.py installs, tests/system/test_demo.py makes
 PORTS = ("8000", "8080", "8090", "6379", "9090", "50051")
@@ -50,11 +61,7 @@ class Block:
 
 def pages() -> list[Path]:
     """Return the documents whose blocks are run: README, tutorial and how-to guides."""
-    return [
-        ROOT / "README.md",
-        *sorted((ROOT / "docs").glob("tutorial/*.md")),
-        *sorted((ROOT / "docs").glob("how-to/*.md")),
-    ]
+    return [README, *sorted((ROOT / "docs").glob("tutorial/*.md")), *sorted(HOW_TO.glob("*.md"))]
 
 
 def blocks(page: Path) -> list[Block]:
@@ -91,15 +98,22 @@ class Shell:
     """A folder that looks like the checkout, in which the blocks of a page run."""
 
     folder: Path
-    network: tuple[str, ...] = ()
-    """The words that run a command in another network (`other_network`)."""
-    ports: dict[str, str] = field(
-        default_factory=lambda: dict(zip(PORTS, map(str, free_ports(len(PORTS))), strict=True))
-    )
+    machine: tuple[str, ...] = ()
+    """The words that run a command on a machine of its own (`namespaces.own_machine`)."""
+    one_ray: OneRay | None = None
+    """Runs the scripts of `examples/`, which would take longer to start than to train."""
+    ports: dict[str, str] = field(init=False)
+    """Free ports for the printed ones, which are free on a machine of its own."""
     terminals: dict[subprocess.Popen[bytes], int] = field(default_factory=dict)
     """The keyboard of each process that was started."""
     staying: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     """Commands that run until Ctrl-C, each in a terminal of its own: one of a kind."""
+
+    def __post_init__(self) -> None:
+        ports = PORTS if self.machine else free_ports(len(PORTS))
+        self.ports = dict(zip(PORTS, map(str, ports), strict=True))
+        self.runtime.mkdir()
+        self.variables.touch()
 
     def run(self, block: Block) -> str:
         """Run a block; return its output. Its last command may stay: it is waited for until it has begun."""
@@ -110,7 +124,10 @@ class Shell:
         stays = STAYS.match(lines[-1]) if lines else None
         done = lines[:-1] if stays else lines
         assert not any(map(STAYS.match, done)), f"pasted, the first command keeps the terminal:\n{block.text}"
-        out = self._finish("".join(line for line in done if not NOT_HERE.match(line)))
+        out = ""
+        for trains, part in groupby(done, self._trains):
+            script = "".join(line for line in part if not NOT_HERE.match(line))
+            out += "".join(map(self._train, script.splitlines())) if trains else self._finish(script)
         if stays:
             self._stay(stays[1], lines[-1].partition(" #")[0].strip())
         return out
@@ -126,12 +143,16 @@ class Shell:
         if kind in self.staying:
             kinds = list(self.staying)  # what began after a server or robot may use it; nothing uses a cockpit
             self._press_ctrl_c(*([kind] if kind == "cockpit" else kinds[kinds.index(kind) :]))
-        if kind in ("serve", "cockpit"):
+        if kind in ("serve", "cockpit") and not self.machine:
             line += f" --port {self.ports['8000' if kind == 'serve' else '8090']}"
-        started = self.staying[kind] = self._start(f"exec env {line}", kind)
+        script = f". {self.variables}\nexec env {line}"
+        started = self.staying[kind] = self._start(script, kind)
         deadline = time.monotonic() + PATIENCE_S
-        while BEGUN.get(kind, "Ctrl-C") not in (printed := self._printed(kind)):
-            assert started.poll() is None, printed
+        while not re.search(BEGUN.get(kind, "Ctrl-C"), printed := self._printed(kind)):
+            if started.poll() is not None:
+                assert RAY_GAVE_UP in printed, printed
+                self._wait(started)
+                started = self.staying[kind] = self._start(script, kind)
             assert time.monotonic() < deadline, f"{line} has not begun:\n{printed}"
             time.sleep(0.1)
 
@@ -151,7 +172,7 @@ class Shell:
 
     def _wait(self, started: subprocess.Popen[bytes]) -> int:
         try:
-            return started.wait(60)
+            return started.wait(PATIENCE_S)
         except subprocess.TimeoutExpired:
             os.killpg(started.pid, signal.SIGKILL)
             started.wait()
@@ -163,7 +184,8 @@ class Shell:
         """Run a script to its end, and answer what it asks."""
         if not script.strip():
             return ""
-        started = self._start("set -e\n" + script, "output")
+        kept = f". {self.variables}\ntrap 'export -p > {self.variables}' EXIT\n"
+        started = self._start(f"set -e\n{kept}{script}", "output")
         deadline, answered = time.monotonic() + PATIENCE_S, 0
         while started.poll() is None:
             if self._printed("output").count(QUESTION) > answered:
@@ -172,8 +194,20 @@ class Shell:
             assert time.monotonic() < deadline, f"{script}\n{self._printed('output')}"
             with suppress(subprocess.TimeoutExpired):
                 started.wait(0.1)
+        if self.machine and started.returncode and RAY_GAVE_UP in self._printed("output"):
+            return self._finish(f"ray stop --force\n{script}")
         assert started.returncode == 0, f"{script}\n{self._printed('output')}"
         return self._printed("output")
+
+    def _trains(self, line: str) -> bool:
+        return self.one_ray is not None and line.startswith("python examples/")
+
+    def _train(self, line: str) -> str:
+        assert self.one_ray is not None
+        _python, script, *arguments = shlex.split(line, comments=True)
+        ended = self.one_ray.run(self.folder, script.removeprefix("examples/"), *arguments).ended
+        assert ended.code == 0, f"{line}\n{ended.out}{ended.err}"
+        return ended.out
 
     def _printed(self, name: str) -> str:
         return (self.folder / f"{name}.txt").read_text(errors="replace")
@@ -183,17 +217,24 @@ class Shell:
         """A folder of its own: a folder `rlservo` beside a script would hide an editable install's package."""
         return self.folder / "runtime"
 
+    @property
+    def variables(self) -> Path:
+        """What the blocks have exported so far, as a script."""
+        return self.runtime / "variables"
+
     def _start(self, script: str, output: str) -> subprocess.Popen[bytes]:
         environment = os.environ | {
             "PATH": f"{self.folder / 'bin'}:{Path(sys.executable).parent}:{os.environ['PATH']}",
             "HOME": str(self.folder),
             "XDG_RUNTIME_DIR": str(self.runtime),
+            "RAY_USAGE_STATS_ENABLED": "0",  # `ray start` asks, and waits for ten seconds
+            "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",  # after 5 Serve kills a HAProxy that is not ready yet
             "RLSERVO_URL": f"http://127.0.0.1:{self.ports['8000']}",
         }
         keyboard, terminal = pty.openpty()  # no bash: it would take it over, and hang up on what it leaves running
         with (self.folder / f"{output}.txt").open("wb") as file:
             started = subprocess.Popen(
-                [*self.network, "sh", "-c", self._with_ports(script)],
+                [*self.machine, "sh", "-c", self._with_ports(script)],
                 cwd=self.folder, env=environment, stdin=terminal, stdout=file, stderr=subprocess.STDOUT,
                 start_new_session=True,
             )  # fmt: skip
@@ -208,29 +249,28 @@ class Shell:
 
 
 @contextmanager
-def shell(folder: Path, network: tuple[str, ...] = ()) -> Iterator[Shell]:
+def shell(folder: Path, machine: tuple[str, ...] = (), one_ray: OneRay | None = None) -> Iterator[Shell]:
     """Make a checkout's look-alike in a folder; what was started there is ended."""
     for name in ("examples", "deploy"):
         (folder / name).symlink_to(ROOT / name)
-    opened = Shell(folder, network)
-    opened.runtime.mkdir()
+    (folder / ".venv").symlink_to(sys.prefix)
+    opened = Shell(folder, machine, one_ray)
     try:
         yield opened
     finally:
         opened.stop()
 
 
-@contextmanager
-def other_network(address: str) -> Iterator[tuple[str, ...]]:
-    """Make a network that has this address; give the words that run a command in it. Skips where none may be made."""
-    script = f"ip link set lo up && ip address add {address}/32 dev lo && echo up && exec cat"
-    command = ["unshare", "--net", "sh", "-c", script]
-    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    with subprocess.Popen(command, text=True, **pipes) as holder:
-        assert holder.stdin is not None and holder.stdout is not None
-        try:
-            if (line := holder.stdout.readline()) != "up\n":
-                pytest.skip(f"no network of its own can be made here: {line.strip()}")
-            yield ("nsenter", f"--net=/proc/{holder.pid}/ns/net")
-        finally:
-            holder.stdin.close()
+def ran(
+    page: Path,
+    folder: Path,
+    machine: tuple[str, ...] = (),
+    one_ray: OneRay | None = None,
+    *,
+    before: str = "",
+    after: str = "",
+) -> str:
+    """Run a page's blocks between commands that stand for what the reader has and does; return what all printed."""
+    with shell(folder, machine, one_ray) as opened:
+        printed = [block for block in blocks(page) if block.language in ("sh", "python") and not block.reason]
+        return "".join(map(opened.run, (Block("sh", before), *printed, Block("sh", after))))

@@ -6,7 +6,6 @@ import importlib
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,22 +13,21 @@ import pytest
 
 from bundles import SHIPPED
 from command_line import rlservo_here
-from documents import ROOT, Block, blocks, commands, other_network, pages, shell, unknown_options
+from documents import HOW_TO, README, ROOT, TUTORIAL, blocks, commands, pages, ran, unknown_options
+from namespaces import own_machine
 from rlservo.deploy.demo.demo import ROBOTS
 from ros import PYTHON, Ros
-from trainings import Trained
 
-README = ROOT / "README.md"
+RAY = HOW_TO / "ray-and-kubernetes.md"
 CARTPOLE = ROOT / "examples" / "checkpoints" / "cartpole_dqn"
-TUTORIAL = ROOT / "docs" / "tutorial" / "first-robot.md"
-HOW_TO = ROOT / "docs" / "how-to"
-# The client of the first two is robo-gym's Python: tests/system/test_robo_gym_client.py runs them. The others need more
-# than a folder with policies.
-ELSEWHERE = {"robo-gym", "real-arm", "export", "sources", "learn-online", "ur-arm", "ros2"}
+# The first two are run by robo-gym's Python, in tests/system/test_robo_gym_client.py, the three that train in
+# tests/examples/test_training_guides.py. The others need more than a folder with policies.
+ELSEWHERE = {"robo-gym", "real-arm", "train", "learn", "learn-online", "export", "sources", "ur-arm", "ros2", RAY.stem}
 REAL_ARM = """
 rlservo ur-controller --model ur5e --host 192.168.0.2 > arm.txt 2>&1 &
 until grep -q Ctrl-C arm.txt; do sleep 0.2; done
 """
+READY = "curl -sf --retry 300 --retry-delay 1 --retry-all-errors http://127.0.0.1:8000/v2/health/ready\n"
 GUIDES = [page for page in pages() if page not in (README, TUTORIAL) and page.stem not in ELSEWHERE]
 
 
@@ -52,30 +50,18 @@ def test_readmes_policy_bears_readmes_disturbance(shipped: Path) -> None:
     assert json.loads(done.stdout)["successes"] >= 18, done
 
 
-def ran(page: Path, folder: Path, network: tuple[str, ...] = (), *, before: str = "") -> str:
-    """Run a page's blocks after the commands that stand for what the reader has; return what they printed."""
-    with shell(folder, network) as opened:
-        opened.run(Block("sh", before))
-        return "".join(
-            opened.run(block) for block in blocks(page) if block.language in ("sh", "python") and not block.reason
-        )
-
-
+@pytest.mark.serve
 @pytest.mark.slow
 def test_readme_runs_as_printed(tmp_path: Path) -> None:
-    printed = ran(README, tmp_path)
-    assert re.search(r'"action":\[(-?[\d.e-]+,){4}-?[\d.e-]+\].*"policy":"ur5"', printed)
+    """Its curl is answered by both engines."""
+    (curl,) = [block.text for block in blocks(README) if block.text.startswith("curl ")]
+    with own_machine(tmp_path) as machine:
+        printed = ran(README, tmp_path, machine, after=READY + curl)
+    assert len(re.findall(r'"action":\[(?:-?[\d.e-]+,){4}-?[\d.e-]+\].*"policy":"ur5"', printed)) == 2
     found = re.search(r"success: (\d+)", printed)
     assert found is not None
     # Random targets, of which the policy reaches 99.4 %: fewer than 18 of 20 would be one run in thousands.
     assert int(found[1]) >= 18
-
-
-@pytest.mark.slow
-def test_tutorial_runs_as_printed(tmp_path: Path) -> None:
-    printed = ran(TUTORIAL, tmp_path)
-    assert "production=2" in printed
-    assert re.search(r"^success$", printed, re.MULTILINE)
 
 
 @pytest.fixture
@@ -91,9 +77,21 @@ def folder(shipped: Path, tmp_path: Path) -> Path:
 def test_guide_runs_as_printed(page: Path, folder: Path, request: pytest.FixtureRequest) -> None:
     if not any(block.language in ("sh", "python") and not block.reason for block in blocks(page)):
         pytest.skip("none of its blocks can run here; the last test checks them")
-    if "s3://bucket/" in page.read_text(encoding="utf-8"):
+    text = page.read_text(encoding="utf-8")
+    if "s3://bucket/" in text:
         request.getfixturevalue("storage").make("bucket")
+    if "--bundle runs/policies/cart-pole" in text:
+        trained = request.getfixturevalue("exported")(request.getfixturevalue("zoo") / "cart_pole").path
+        shutil.copytree(trained.parent, folder / "runs" / "policies" / "cart-pole")
     ran(page, folder)
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_guide_to_ray_runs_as_printed(folder: Path) -> None:
+    with own_machine(folder) as machine:
+        printed = ran(RAY, folder, machine)
+    assert "status: RUNNING" in printed
 
 
 @pytest.mark.slow
@@ -124,18 +122,11 @@ def test_guide_to_sources_runs_as_printed(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_guide_to_online_learning_runs_as_printed(trained: Callable[[str], Trained], folder: Path) -> None:
-    (checkpoint,) = trained("ur").folder.glob("runs/PPO-*/*/checkpoint_*")
-    shutil.copytree(checkpoint, folder / "runs" / "ppo" / "checkpoint")
-    ran(HOW_TO / "learn-online.md", folder)
-
-
-@pytest.mark.slow
 def test_guide_to_a_real_arm_runs_as_printed(folder: Path) -> None:
-    """The arm at the page's address is simulated, in a network of its own."""
+    """The arm at the page's address is simulated."""
     pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
-    with other_network("192.168.0.2") as network:
-        printed = ran(HOW_TO / "ur-arm.md", folder, network, before=REAL_ARM)
+    with own_machine(folder, "192.168.0.2") as machine:
+        printed = ran(HOW_TO / "ur-arm.md", folder, machine, before=REAL_ARM)
     assert "The policy must pass:" in printed
 
 

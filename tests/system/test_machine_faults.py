@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 import grpc
 import pytest
 
+from namespaces import in_own_namespace
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from servers import ROOT, launched
@@ -37,14 +37,6 @@ sys.path.insert(0, "examples")
 from robo_gym_client import VERIFY, answers
 print(answers("127.0.0.1", int(sys.argv[1]), VERIFY))
 """
-
-
-def in_own_namespace(*options: str) -> list[str]:
-    """Return the beginning of a command that runs with its own mounts or network, or skip."""
-    command = ["unshare", "--map-root-user", *options]
-    if shutil.which("unshare") is None or subprocess.run([*command, "true"], capture_output=True).returncode != 0:
-        pytest.skip("this machine allows no namespaces of one's own")
-    return command
 
 
 def test_a_full_disk_ends_the_recording_and_nothing_else(policies: Path, tmp_path: Path) -> None:
