@@ -58,6 +58,7 @@ TOGETHER = {
     "tests/examples/test_slurm.py::test_several_nodes": "several nodes",
     "tests/examples/test_slurm.py": "sweep",
     "tests/examples/test_tour.py": "one Ray",
+    "tests/examples/test_training_guides.py": "one Ray",
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 

@@ -1,7 +1,7 @@
 """Run training scripts one after the other in one process and one Ray, where starting a Ray is not what is tested.
 
-A request is a line on standard input, ["FOLDER", "SCRIPT", "ARGUMENT", ...]: the folder is made, and the script runs
-in it. The reply is a line on standard output: the folder, how it ended, and what it left in the home folder.
+A request is a line on standard input, ["FOLDER", "SCRIPT", "ARGUMENT", ...]: the script runs in the folder, made if it
+is new. The reply is a line on standard output: the folder, how it ended, and what it left in the home folder.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def main() -> None:
         training_run.ray_session = lambda **_: contextlib.nullcontext()  # the scripts' own
         for line in sys.stdin:
             folder, *words = json.loads(line)
-            Path(folder).mkdir()
+            Path(folder).mkdir(exist_ok=True)
             os.chdir(folder)
             before = in_home()
             code, out, err = run(*words)

@@ -64,7 +64,6 @@ def _again(name: str, *changes: str) -> tuple[str, ...]:
 
 OFFSCREEN = bool(os.environ.get("DISPLAY") or find_library("EGL") or find_library("OSMesa"))
 IN_ONE_RAY = {
-    "ur": _inference("training_inference_ur.py"),
     "mir": _inference("training_inference_mir.py", "--num-cpus", "1"),
     "tour": ("tour.py", "--quick", *(() if OFFSCREEN else ("--no-video",))),
     "again": _again(
@@ -122,7 +121,7 @@ class OneRay:
         self._errors = errors
 
     def run(self, folder: Path, *words: str) -> Trained:
-        """Run a script with these arguments in a new folder."""
+        """Run a script with these arguments in a folder."""
         process = self._process
         assert process.stdin is not None and process.stdout is not None
         process.stdin.write(json.dumps([str(folder), *words]) + "\n")
