@@ -185,7 +185,7 @@ def drive_environment(
         if not unproven:
             check_proven(node.policy.contract, env)
         target = _Target(frame)
-        node.link.subscribe("~/target", POSE_STAMPED, target.take, is_kept=False)
+        node.link.subscribe("~/target", POSE_STAMPED, target.take)
         robot: Any = env.unwrapped
         done = 0
         while not stop.is_set():

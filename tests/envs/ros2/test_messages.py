@@ -65,10 +65,10 @@ class Outlet:
     def now_s(self) -> float:
         return 1.0
 
-    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> object:
+    def advertise(self, topic: str, kind: str) -> object:
         return lambda values: self.sent.__setitem__(topic, messages.parse(json.loads(json.dumps(values))))
 
-    def subscribe(self, topic: str, kind: str, on_message: object, *, is_kept: bool = False) -> None: ...
+    def subscribe(self, topic: str, kind: str, on_message: object) -> None: ...
 
     def close(self) -> None: ...
 
