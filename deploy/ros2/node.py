@@ -127,7 +127,7 @@ def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | 
     inputs = ElementInputs(node.link, observed, max_age_s or max(0.1, 2.0 / rate_hz))
     kinds, name_of = {place.topic: place.kind for place in acted}, node.link.node.resolve_topic_name
     publishers = {topic: take_command(node.link, name_of(topic), kind) for topic, kind in kinds.items()}
-    outputs = ElementOutputs(acted, publishers)
+    outputs = ElementOutputs(acted, publishers, node.link.now_s)
     due, was_running = time.monotonic(), False
     while not stop.is_set():
         due = max(due + 1.0 / rate_hz, time.monotonic())
