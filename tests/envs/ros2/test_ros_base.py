@@ -48,6 +48,7 @@ def position(graph: Ros) -> tuple[float, float]:
 
 
 @pytest.mark.skipif(not EPISODES, reason="takes minutes: RLSERVO_ROS_TARGETS=100 asks for 100 episodes")
+@pytest.mark.timeout(7200)
 @pytest.mark.parametrize(
     ("name", "env_id", "world"),
     [
