@@ -178,6 +178,8 @@ class Ros:
         limit = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < limit, "\n".join(["the condition never came true:", *self._last_lines()])
+            for one in self._processes:
+                one.read_all()  # a full pipe would stop it
             time.sleep(0.1)
 
     # -- a node of rlservo's
@@ -201,22 +203,34 @@ class Ros:
             values={"header": {"frame_id": frame}, "pose": {"position": {"x": x, "y": y, "z": z}}},
         )  # fmt: skip
 
-    def drive_to(self, *target: float, frame: str = "base_link") -> dict[str, str]:
-        """Return the heartbeat after a target has been driven to."""
+    def begin_driving(self, *target: float, frame: str = "base_link") -> None:
+        """Give a target and wait until the policy drives to it."""
         episodes, given = int(self.heartbeat()["episodes"]), 0.0
 
         def is_taken() -> bool:
             nonlocal given
-            if int(self.heartbeat()["episodes"]) > episodes:
+            beat = self.heartbeat()
+            if int(beat["episodes"]) > episodes:
                 return True
-            if time.monotonic() > given + REPEAT_S:  # a node that is new may not have discovered the publisher yet
+            # A node that is new may not have discovered the publisher yet.
+            if beat["state"] != "starting" and time.monotonic() > given + REPEAT_S:
                 given = time.monotonic()
                 self.give_target(*target, frame=frame)
             return False
 
         self.wait_until(is_taken)
-        self.wait_until(lambda: self.heartbeat()["state"] not in ("running", "hold"))
-        return self.heartbeat()
+
+    def drive_to(self, *target: float, frame: str = "base_link") -> dict[str, str]:
+        """Return the heartbeat after a target has been driven to."""
+        self.begin_driving(*target, frame=frame)
+        beat: dict[str, str] = {}
+
+        def is_over() -> bool:
+            beat.update(self.heartbeat())
+            return beat["state"] not in ("running", "hold")
+
+        self.wait_until(is_over)
+        return beat
 
     # -- a robot
 

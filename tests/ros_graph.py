@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import sys
 import threading
 import time
@@ -52,6 +53,7 @@ def main() -> None:
     threading.Thread(target=executor.spin, daemon=True).start()
     messages: dict[str, list[tuple[float, Any]]] = defaultdict(list)
     made: dict[str, Any] = {}
+    arrived: dict[str, int] = {}
 
     def take(topic: str, message: Any) -> None:
         messages[topic].append((time.time(), message))
@@ -70,6 +72,22 @@ def main() -> None:
             made_s = time.time() - age_s
             message.header.stamp.sec, message.header.stamp.nanosec = int(made_s), int(made_s % 1 * 1e9)
         made[topic].publish(message)
+
+    def lead(topic: str, targets: list[tuple[float, float]]) -> None:
+        """Publish distance and direction of one target after the other [m], [rad], as seen from a base on /odom."""
+        made[topic] = node.create_publisher(interface("std_msgs/msg/Float64MultiArray"), topic, 1)
+        arrived[topic] = 0
+
+        def look(odometry: Any) -> None:
+            place, turn = odometry.pose.pose.position, odometry.pose.pose.orientation
+            x, y = targets[min(arrived[topic], len(targets) - 1)]
+            distance = math.hypot(x - place.x, y - place.y)
+            direction = math.atan2(y - place.y, x - place.x) - 2.0 * math.atan2(turn.z, turn.w)
+            arrived[topic] += distance < 0.2
+            seen = [distance, math.remainder(direction, 2.0 * math.pi)]
+            made[topic].publish(fill(made[topic].msg_type(), {"data": seen}))
+
+        node.create_subscription(interface("nav_msgs/msg/Odometry"), "/odom", look, 1)
 
     def wait_for_subscriber(topic: str) -> None:
         limit = time.monotonic() + 60.0
@@ -95,7 +113,10 @@ def main() -> None:
     def publishers(topic: str) -> Any:
         return [one.node_name for one in node.get_publishers_info_by_topic(topic)]
 
-    known = {"subscribe": subscribe, "publish": publish, "call": call, "since": since, "publishers": publishers}
+    known = {
+        "subscribe": subscribe, "publish": publish, "call": call, "since": since, "publishers": publishers,
+        "lead": lead, "arrived": lambda topic: arrived[topic],
+    }  # fmt: skip
     print(json.dumps("ready"), flush=True)
     for line in sys.stdin:
         name, arguments = json.loads(line)

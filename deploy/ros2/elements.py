@@ -150,8 +150,8 @@ class ElementInputs:
 class ElementOutputs:
     """Actions as messages: elements of one topic make one message."""
 
-    def __init__(self, places: Sequence[Place], publishers: Mapping[str, Publish]) -> None:
-        self._places, self._publishers = places, publishers
+    def __init__(self, places: Sequence[Place], publishers: Mapping[str, Publish], now_s: Callable[[], float]) -> None:
+        self._places, self._publishers, self._now_s = places, publishers, now_s
 
     def act(self, action: NDArray[np.floating[Any]]) -> None:
         """Publish one action."""
@@ -173,6 +173,6 @@ class ElementOutputs:
                 part.setdefault(last, []).append(number)
         for place in self._places:
             if place.kind.endswith("Stamped") or place.kind == JOINT_STATE:
-                messages[place.topic]["header"] = {"stamp": stamp(time.time())}
+                messages[place.topic]["header"] = {"stamp": stamp(self._now_s())}
         for topic, values in messages.items():
             self._publishers[topic](values)

@@ -127,7 +127,7 @@ def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | 
     inputs = ElementInputs(node.link, observed, max_age_s or max(0.1, 2.0 / rate_hz))
     kinds, name_of = {place.topic: place.kind for place in acted}, node.link.node.resolve_topic_name
     publishers = {topic: take_command(node.link, name_of(topic), kind) for topic, kind in kinds.items()}
-    outputs = ElementOutputs(acted, publishers)
+    outputs = ElementOutputs(acted, publishers, node.link.now_s)
     due, was_running = time.monotonic(), False
     while not stop.is_set():
         due = max(due + 1.0 / rate_hz, time.monotonic())
@@ -158,12 +158,12 @@ def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | 
 
 
 class _Target:
-    """The newest target."""
+    """The newest target, and the numbers of those that were begun and that are over."""
 
     def __init__(self, frame: str) -> None:
         self._frame = frame
         self.pose: Any = None
-        self.number = 0
+        self.number = self.begun = self.done = 0
 
     def take(self, message: Any) -> None:
         frame = message.header.frame_id
@@ -185,35 +185,46 @@ def drive_environment(
         if not unproven:
             check_proven(node.policy.contract, env)
         target = _Target(frame)
-        node.link.subscribe("~/target", POSE_STAMPED, target.take, is_kept=False)
+        node.link.subscribe("~/target", POSE_STAMPED, target.take)
         robot: Any = env.unwrapped
-        done = 0
+        robot.simulation.is_called_off = lambda: stop.is_set() or node.wanted is not Wanted.RUN
         while not stop.is_set():
             if node.wanted is not Wanted.RUN:
                 node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
-            elif target.number == done:
+            elif robot.simulation.operator.has_taken_over:
+                node.enter("human")
+            elif target.number == target.done:
                 if node.state not in ("arrived", "fault", "refused"):
                     node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
             else:
-                done = _drive_to(node, stop, env, option, target)
+                _drive_to(node, stop, env, option, target)
                 continue
             robot.simulation.advance()  # the model stays where the robot is
     finally:
         env.close()
 
 
-def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, target: _Target) -> int:
-    """Drive to the newest target; return its number, or one that is still due if it was interrupted by a hold."""
+def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, target: _Target) -> None:
+    """Drive to the newest target, which remains due if the drive is interrupted.
+
+    As in a rollout an arm first returns to its start: that is where its policy was trained and proven. After an
+    interruption it goes on from its present pose.
+    """
     robot, policy = env.unwrapped, node.policy
     number, position = target.number, target.pose
     goal = [position.x, position.y, position.z] if option == "ee_target_pose" else [position.x, position.y]
     goal += [0.0] * ((6 if option == "ee_target_pose" else 3) - len(goal))
-    options = {**robot.reset_options(start="here"), option: goal}
+    if target.begun != number:
+        node.enter("starting")
+    options = {**robot.reset_options(start="here" if target.begun == number else "own"), option: goal}
     try:
         observation, _ = env.reset(options=options)
-    except ValueError as error:  # a robot must not move by itself once its fault is mended: a new target is needed
-        node.enter("fault" if isinstance(error, RobotError) else "refused", str(error))
-        return number
+    except ValueError as error:
+        if not robot.simulation.is_called_off():
+            node.enter("fault" if isinstance(error, RobotError) else "refused", str(error))
+            target.done = number  # a robot must not move by itself once its fault is mended: a new target is needed
+        return
+    target.begun = number
     policy.reset()
     is_first = True
     while not stop.is_set() and node.wanted is Wanted.RUN and target.number == number:
@@ -224,7 +235,7 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
             node.counts["late"] += 1
             robot.simulation.hold()
             robot.simulation.advance()
-            return number - 1
+            return
         node.counts["episodes"] += is_first
         is_first = False
         observation, reward, terminated, truncated, info = env.step(action)
@@ -244,6 +255,6 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
             log.info("node: target %d: %s", number, status)
             is_fault = robot.simulation.stopped_by is not None
             node.enter("fault" if is_fault else "arrived", status)
-            return number
+            target.done = number
+            return
     robot.simulation.hold()
-    return number - 1 if target.number == number else number

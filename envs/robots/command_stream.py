@@ -292,13 +292,13 @@ class CommandStream:
             self._number = number
             self._goal = limiter.goal_within(orders["goal"])
             self._goal_due_s = float(orders["given_s"] + orders["duration_s"])
+        if now - float(orders["given_s"]) > self._settings.setpoint_timeout_s:
+            self._count_once(Phase.LATE, LATE)
+            return standstill, 1.0
         if order == Order.GO:
             self._phase, limiter.velocity_limits = Phase.GO, self._start_velocities
             return limiter.velocity_towards(self._goal, 0.0, dt), fraction
         limiter.velocity_limits = self._policy_velocities
-        if now - float(orders["given_s"]) > self._settings.setpoint_timeout_s:
-            self._count_once(Phase.LATE, LATE)
-            return standstill, 1.0
         self._phase = Phase.FOLLOW
         blend = (now - float(orders["blend_from_s"])) / self._limits.blend_s if self._limits.blend_s else 1.0
         self._blend = min(max(blend, 0.0), 1.0)

@@ -62,6 +62,7 @@ class Mirror(ABC, Generic[RobotT, MeasuredT]):
     ) -> None:
         """`connect` takes the time [s] after which the robot holds without a command; its errors are raised."""
         self.operator, self.states = operator, StateMachine()
+        self.is_called_off: Callable[[], bool] = lambda: False  # whether a motion to the start is to end
         self.stale_actions = 0
         self._connect, self._cycle_s, self._age_bound_s = connect, cycle_s, age_bound_s
         self._due_s = 0.0

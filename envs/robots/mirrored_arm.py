@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.checks import InvalidResetError
 from rlservo.envs.robots.arm import ArmState, RobotError
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 AT_START = 0.03  # [rad], within which the arm need not move
 PATH_STEP = 0.05  # [rad], between two checked poses of a path
 SETTLE_S = 0.2
+
+Vector = NDArray[np.float64]
 
 
 # `stopped_by` has one type in both bases.
@@ -70,31 +72,15 @@ class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[r
     def place(self, joint_positions: ArrayLike) -> bool:
         """Move the arm slowly to joint positions [rad] (6,), after confirmation; return whether it would collide there.
 
-        Raises InvalidResetError if something is in the way, RobotError if the robot has stopped.
+        An arm that a person leads, or takes over on the way, is left to that person. Raises InvalidResetError if
+        something is in the way or the motion is called off, RobotError if the robot has stopped.
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         if super().place(goal):
             return True
         self._recover()
-        start = self._robot.arm_state().positions
-        away = float(np.abs(goal - start).max())
-        for share in np.linspace(0.0, 1.0, 2 + int(away / PATH_STEP)):
-            if super().place(start + share * (goal - start)) and share > 0.0:
-                links = " and ".join(self.contacts()[0])
-                raise InvalidResetError(f"{links} would touch on the straight path to the start: move the arm by hand")
-        if away > AT_START:
-            speed = self._robot.limits.start_speed * self._robot.limits.speed_scale
-            self.operator.confirm(f"the robot will move to its start, {away:.2f} rad at {speed:.2g} rad/s")
-            self.states.enter(State.GO_TO_START, f"{away:.2f} rad away")
-            try:
-                self._robot.go_to(goal)
-            except RobotError as error:
-                self.states.enter(State.FAULT, str(error))
-                raise
-            self.states.enter(State.READY)
-        elif self.states.state not in (State.READY, State.HUMAN):
-            self._robot.hold()
-            self.states.enter(State.READY)
+        if self.states.state != State.HUMAN:
+            self._go_to(goal)
         self.in_collision, self.stopped_by = False, None
         self._look()
         self._begin()
@@ -129,6 +115,30 @@ class MirroredArm(Mirror[RtdeArm, ArmState], URSimulation):  # pyright: ignore[r
         super().close()
         if self._metrics is not None:
             self._metrics.close()
+
+    # -- parts
+
+    def _go_to(self, goal: Vector) -> None:
+        start = self._robot.arm_state().positions
+        away = float(np.abs(goal - start).max())
+        for share in np.linspace(0.0, 1.0, 2 + int(away / PATH_STEP)):
+            if super().place(start + share * (goal - start)) and share > 0.0:
+                links = " and ".join(self.contacts()[0])
+                raise InvalidResetError(f"{links} would touch on the straight path to the start: move the arm by hand")
+        if away > AT_START:
+            speed = self._robot.limits.start_speed * self._robot.limits.speed_scale
+            self.operator.confirm(f"the robot will move to its start, {away:.2f} rad at {speed:.2g} rad/s")
+            self.states.enter(State.GO_TO_START, f"{away:.2f} rad away")
+            try:
+                self._robot.go_to(goal, lambda: self.operator.has_taken_over or self.is_called_off())
+            except RobotError as error:
+                self.states.enter(State.FAULT, str(error))
+                raise
+        else:
+            self._robot.hold()
+        self.states.enter(State.READY)
+        if self.is_called_off():
+            raise InvalidResetError("the motion to the start was called off")
 
     # -- the mirror's
 

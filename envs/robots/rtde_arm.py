@@ -8,6 +8,7 @@ import selectors
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -111,13 +112,16 @@ class RtdeArm:
         """Hold, and let the speed of later commands grow from 0, or be full `at_once`."""
         self._give(Order.HOLD, blend_from_s=0.0 if at_once else time.monotonic())
 
-    def go_to(self, joint_positions: ArrayLike) -> None:
-        """Move slowly to joint positions [rad] (6,) and wait until the arm is at rest there. Raises RobotError."""
+    def go_to(self, joint_positions: ArrayLike, is_interrupted: Callable[[], bool] = lambda: False) -> None:
+        """Move slowly to joint positions [rad] (6,) and wait until the arm is at rest there, or interrupted.
+
+        Raises RobotError if it does not arrive.
+        """
         goal = np.asarray(joint_positions, dtype=np.float64)
-        self._give(Order.GO, goal=goal)
         slowest = self.limits.start_speed * self.limits.speed_scale
         limit = time.monotonic() + 30.0 + 5.0 * float(np.abs(goal - self.arm_state().positions).max()) / slowest
-        while True:
+        while not is_interrupted():
+            self._give(Order.GO, goal=goal)  # each time: the arm holds when this process stops
             state = self.arm_state()
             if np.abs(state.positions - goal).max() < REACHED and np.abs(state.velocities).max() < AT_REST:
                 break

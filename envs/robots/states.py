@@ -25,15 +25,15 @@ class State(str, Enum):
     FAULT = "fault"
 
 
-_MOVING = {State.BLEND_IN, State.RUN, State.HOLD, State.HUMAN, State.READY}
+_MOVING = {State.BLEND_IN, State.RUN, State.HOLD, State.HUMAN, State.READY, State.GO_TO_START}
 FOLLOWS: dict[State, set[State]] = {
     State.CONNECT: {State.CHECK},
     State.CHECK: {State.READY},
     State.READY: {State.GO_TO_START, State.BLEND_IN, State.HUMAN},
     State.GO_TO_START: {State.READY},
     State.BLEND_IN: _MOVING,
-    State.RUN: _MOVING | {State.GO_TO_START},
-    State.HOLD: _MOVING | {State.GO_TO_START},
+    State.RUN: _MOVING,
+    State.HOLD: _MOVING,
     State.HUMAN: {State.READY, State.BLEND_IN, State.HOLD},
     State.STOP: {State.CONNECT},
     State.FAULT: {State.CONNECT},

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.address import ARM_OPTIONS, COMMAND_TOPICS, RosAddress
-from rlservo.envs.ros2.link import FIRST_MESSAGES_S, check_clock, open_link, take_command, wait_until
+from rlservo.envs.ros2.link import FIRST_MESSAGES_S, check_clock, take_command, wait_until
 from rlservo.envs.ros2.messages import (
     FLAG,
     INT8,
@@ -26,6 +26,7 @@ from rlservo.envs.ros2.messages import (
     stamp_of,
     trajectory,
 )
+from rlservo.envs.ros2.rclpy_link import RclpyLink
 
 if TYPE_CHECKING:
     from rlservo.envs.robots.command_stream import StreamSettings
@@ -62,7 +63,7 @@ class RosArmConnection:
         self._setpoint: Vector | None = None
         self._fastest = 0.0  # [rad/s], of the latest setpoints
         self._guard: subprocess.Popen[bytes] | None = None
-        self._link = open_link(address, "rlservo_arm")
+        self._link = RclpyLink("rlservo_arm")
         try:
             self._subscribe()
             topic = address["commands"] or COMMAND_TOPICS[self._how]

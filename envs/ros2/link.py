@@ -36,11 +36,11 @@ class Topics(Protocol):
         """Return ROS's time [s]."""
         ...
 
-    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
-        """Call `on_message` with each new message; `is_kept`: also with the last earlier one, if kept."""
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
+        """Call `on_message` with each new message."""
         ...
 
-    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
+    def advertise(self, topic: str, kind: str) -> Publish:
         """Return a function that publishes a message given as a dictionary."""
         ...
 

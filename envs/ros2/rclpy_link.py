@@ -59,7 +59,7 @@ class RclpyLink:
         return float(self.node.get_clock().now().nanoseconds * 1e-9)
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
-        """Subscribe to the newest message, best effort as for sensors; to a kept one reliably."""
+        """Subscribe to the newest message, best effort as for sensors; `is_kept`: reliably, to an earlier one too."""
         qos = self._qos(is_kept, False)
         made = self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), qos)
         self._own["subscriber", made.topic_name] += 1

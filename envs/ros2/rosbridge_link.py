@@ -45,16 +45,15 @@ class RosbridgeLink:
         """Return the system's time [s]."""
         return time.time()
 
-    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
         """Subscribe to the newest message."""
-        del is_kept  # the bridge's own subscription decides this
         one = self._library.Topic(self._ros, topic, kind, queue_length=1)
         one.subscribe(safely(lambda message: on_message(parse(message)), topic))
         self._topics.append(one)
 
-    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
+    def advertise(self, topic: str, kind: str) -> Publish:
         """Publish only the newest message."""
-        one = self._library.Topic(self._ros, topic, kind, queue_size=1, latch=is_kept)
+        one = self._library.Topic(self._ros, topic, kind, queue_size=1)
         one.advertise()
         self._topics.append(one)
 

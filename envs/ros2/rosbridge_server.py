@@ -75,7 +75,6 @@ class RosbridgeServer:
         self._lock = threading.Lock()
         self._types: dict[str, str] = {}
         self._published: set[str] = set()
-        self._kept: dict[str, str] = {}
         self._takers: dict[str, Callable[[Any], None]] = {}
         self._count = 0
         try:
@@ -92,12 +91,11 @@ class RosbridgeServer:
         """Return the system's time [s]."""
         return time.time()
 
-    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
         """Call `on_message` with the messages that clients publish."""
-        del is_kept
         self._types[topic], self._takers[topic] = kind, on_message
 
-    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
+    def advertise(self, topic: str, kind: str) -> Publish:
         """Return a function that sends to the subscribed clients."""
         self._types[topic] = kind
         self._published.add(topic)
@@ -105,10 +103,8 @@ class RosbridgeServer:
         def publish(values: Mapping[str, Any]) -> None:
             with self._lock:
                 takers = [client for client in self._clients if topic in client.subscribed]
-            if takers or is_kept:
+            if takers:
                 text = json.dumps({"op": "publish", "topic": topic, "msg": values})
-                if is_kept:
-                    self._kept[topic] = text
                 for client in takers:
                     client.send(topic, text)
 
@@ -145,8 +141,6 @@ class RosbridgeServer:
             op, topic = request["op"], str(request.get("topic", ""))
             if op == "subscribe":
                 client.subscribed.add(topic)
-                if topic in self._kept:
-                    client.send(topic, self._kept[topic])
             elif op == "unsubscribe":
                 client.subscribed.discard(topic)
             elif op == "advertise":

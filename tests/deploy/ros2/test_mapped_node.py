@@ -20,7 +20,7 @@ from ros import PYTHON, Process, Ros, SlowServer
 from servers import free_ports, over_uvicorn
 
 JOINTS = ("shoulder", "elbow", "wrist")
-COMMANDS, REST = "/forward_command_controller/commands", "/rest"
+COMMANDS, REST, TARGET = "/forward_command_controller/commands", "/rest", "/target_polar"
 MAX_AGE_S = 1.0
 
 
@@ -133,6 +133,27 @@ def test_node_holds_for_a_slow_and_for_a_lost_server_and_goes_on(ros: Ros, bundl
     until_state(ros, "cannot be reached", act, "served")
     with over_uvicorn(SlowServer(bundle.parents[1]), port):
         until_state(ros, "running", act, "served")
+
+
+def test_mapped_policy_drives_a_base_to_twenty_targets(ros: Ros, all_shipped: Path) -> None:
+    places = {
+        "observation.target_r": f"{TARGET} std_msgs/msg/Float64MultiArray data[0]",
+        "observation.target_theta": f"{TARGET} std_msgs/msg/Float64MultiArray data[1]",
+        "observation.linear_velocity": "/odom nav_msgs/msg/Odometry twist.twist.linear.x",
+        "observation.angular_velocity": "/odom nav_msgs/msg/Odometry twist.twist.angular.z",
+        "action.linear_velocity_normalized": "/cmd_vel geometry_msgs/msg/Twist linear.x * 0.5",
+        "action.angular_velocity_normalized": "/cmd_vel geometry_msgs/msg/Twist angular.z * 0.7",
+    }
+    words = [word for name, place in places.items() for word in ("-p", f"{name}:={place}")]
+    sim = ros.rlservo("ros2-sim", "mir100")
+    sim.wait_for("mir100 on ROS 2")
+    turns = 0.5 * np.arange(20)
+    ros.ask("lead", topic=TARGET, targets=np.stack([np.cos(turns), np.sin(turns)], axis=1).tolist())
+    ros.rlservo(
+        "ros2", "--bundle", all_shipped / "mir100_navigation", "--name", "mapped", "--autostart", "--ros-args", *words
+    )
+    for number in range(len(turns)):
+        ros.wait_until(lambda number=number: ros.ask("arrived", topic=TARGET) > number)
 
 
 @pytest.mark.parametrize("name", ["second", "rlservo"])

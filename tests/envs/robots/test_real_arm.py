@@ -146,6 +146,11 @@ def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -
             env.step(action)
             assert time.monotonic() < limit
         arm.do(lambda: arm.controller.simulation.data.qfrc_applied.__setitem__(0, 0.0))
+        simulation.hold()  # an episode's end, or a late answer of the policy's server, takes nothing from the person
+        env.reset(options={"joint_positions": START + 0.5})
+        for _ in range(5):
+            _, _, _, _, info = env.step(action)
+        assert arm.controller.is_free and info["robot"]["state"] == "human"
         simulation.operator.toggle()
         states = []
         for _ in range(30):
@@ -154,6 +159,13 @@ def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -
             if "run" in states or terminated:
                 break
         assert "blend_in" in states
+
+        simulation.operator.toggle()
+        env.reset(options={"joint_positions": START + 1.0})  # on the way to a start, too
+        while not arm.controller.is_free:
+            env.step(action)
+            assert time.monotonic() < limit
+        assert abs(arm.controller.simulation.joint_positions - START - 1.0).max() > 0.1
         assert arm.controller.safety_mode.name == "NORMAL"
 
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rlservo.deploy.ros2.elements import Place
+from rlservo.deploy.ros2.elements import ElementOutputs, Place
 from rlservo.envs.mir100.parameters import BACK_SCANNER, FRONT_SCANNER
 from rlservo.envs.mir100.simulation import Mir100Simulation
 from rlservo.envs.robots.arm import RobotError
@@ -65,10 +65,10 @@ class Outlet:
     def now_s(self) -> float:
         return 1.0
 
-    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> object:
+    def advertise(self, topic: str, kind: str) -> object:
         return lambda values: self.sent.__setitem__(topic, messages.parse(json.loads(json.dumps(values))))
 
-    def subscribe(self, topic: str, kind: str, on_message: object, *, is_kept: bool = False) -> None: ...
+    def subscribe(self, topic: str, kind: str, on_message: object) -> None: ...
 
     def close(self) -> None: ...
 
@@ -112,6 +112,16 @@ def test_place_of_an_element_reads_a_joint_by_name_and_converts_units() -> None:
     assert joint.read(SimpleNamespace(name=["hinge"], position=[1.0])) is None
     with pytest.raises(UsageError, match="element 'x' is mapped to '/topic': expected TOPIC TYPE FIELD"):
         Place.parse("x", "/topic")
+
+
+def test_action_is_one_message_per_topic_stamped_by_the_graphs_clock() -> None:
+    sent: list[object] = []
+    places = [
+        Place.parse(name, f"/cmd_vel geometry_msgs/msg/TwistStamped twist.{name}") for name in ("linear.x", "angular.z")
+    ]
+    ElementOutputs(places, {"/cmd_vel": sent.append}, lambda: 12.25).act(np.array([0.5, -0.25]))
+    header = {"stamp": {"sec": 12, "nanosec": 250_000_000}}
+    assert sent == [{"twist": {"linear": {"x": 0.5}, "angular": {"z": -0.25}}, "header": header}]
 
 
 def test_limits_of_a_base_are_checked_by_name() -> None:

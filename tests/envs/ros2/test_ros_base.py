@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
+from collections import Counter
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from ros import Process, Ros
+from rlservo.serve_app.runtime.policy import Policy
+from ros import STANDS, Process, Ros
 
-TARGETS = int(os.environ.get("RLSERVO_ROS_TARGETS", "2"))
+EPISODES = int(os.environ.get("RLSERVO_ROS_TARGETS", "0"))  # of each policy beside the simulator, for a long run
+TARGETS = 20
 FAST = 0.2  # [m/s]
 TIMEOUT_S = 0.5  # of the base's own drive
 BRAKING_S = 1.0  # from 0.5 m/s, and a busy machine
@@ -33,6 +40,56 @@ def start_node(ros: Ros, all_shipped: Path, *options: object) -> Process:
     )  # fmt: skip
 
 
+def position(graph: Ros) -> tuple[float, float]:
+    """Return where the base is [m]."""
+    states = graph.ask("since", topic="/odom", time_s=0.0, count=1)
+    place = states[-1][1]["pose"]["pose"]["position"] if states else {"x": math.nan, "y": math.nan}
+    return place["x"], place["y"]
+
+
+@pytest.mark.skipif(not EPISODES, reason="takes minutes: RLSERVO_ROS_TARGETS=100 asks for 100 episodes")
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize(
+    ("name", "env_id", "world"),
+    [
+        ("mir100_navigation", "NoObstacleNavigationMir100Sim-v0", "empty"),
+        ("mir100_obstacle_avoidance", "ObstacleAvoidanceMir100Sim-v0", "lab_6x8"),
+    ],
+)
+def test_policy_succeeds_through_topics_as_often_as_in_the_simulator(
+    name: str, env_id: str, world: str, all_shipped: Path
+) -> None:
+    env = gym.make(f"rlservo.envs:rlservo/{env_id}", disable_env_checker=True)
+    simulation: Any = env.unwrapped.simulation  # type: ignore[attr-defined]
+    options = {"cubes": simulation.world.cubes} if world != "empty" else {}
+    policy = Policy.load(all_shipped / name / "1")
+    outcomes: Counter[tuple[str, str]] = Counter()
+    with policy, closing(env), closing(Ros()) as graph:
+        sim = graph.rlservo("ros2-sim", "mir100", "--world", world)
+        sim.wait_for("mir100 on ROS 2")
+        graph.watch("/odom", "nav_msgs/msg/Odometry")
+        node = graph.rlservo("ros2", "--bundle", all_shipped / name, "--unproven", "--autostart")
+        node.wait_for("check -> ready")
+        for seed in range(EPISODES):
+            observation, _ = env.reset(seed=seed, options=options)
+            policy.reset()
+            start, (x, y, _) = simulation.pose, simulation.target
+            graph.wait_until(lambda: graph.speed() < STANDS)
+            sim.type("place " + " ".join(map(str, start)))
+            graph.wait_until(lambda start=start: position(graph) == pytest.approx(start[:2], abs=1e-3))
+            is_over, info = False, {}
+            while not is_over:
+                observation, _, terminated, truncated, info = env.step(policy.act(observation))
+                is_over = terminated or truncated
+            there = graph.drive_to(x, y, frame="odom")["message"]
+            outcomes[info["final_status"], there] += 1
+            print(seed, info["final_status"], there, flush=True)
+    print(name, dict(outcomes))
+    simulated = sum(count for (status, _), count in outcomes.items() if status == "success")
+    through_topics = sum(count for (_, message), count in outcomes.items() if message == "arrived: success")
+    assert through_topics >= simulated - 0.02 * EPISODES, outcomes
+
+
 def get_moving(ros: Ros, side: float) -> None:
     ros.drive_to(-1.5 * side, 0.0, frame="odom")
     ros.give_target(1.5 * side, 0.0, frame="odom")
@@ -44,9 +101,9 @@ def test_base_reaches_its_targets_and_stands_when_its_process_stops_or_dies(
 ) -> None:
     node = start_node(ros, all_shipped)
     node.wait_for("check -> ready")
-    draw, outcomes = np.random.default_rng(5), []
-    for _ in range(TARGETS):
-        outcomes.append(ros.drive_to(*draw.uniform(-1.0, 1.0, 2).tolist(), frame="odom")["message"])
+    draw = np.random.default_rng(5)
+    around = [draw.uniform(0.8, 1.2) * np.array([math.cos(turn), math.sin(turn)]) for turn in 0.5 * np.arange(TARGETS)]
+    outcomes = [ros.drive_to(*target.tolist(), frame="odom")["message"] for target in around]
     assert outcomes.count("arrived: success") >= len(outcomes) - len(outcomes) // 20, outcomes
 
     second = start_node(ros, all_shipped, "--name", "second")

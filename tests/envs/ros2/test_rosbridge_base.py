@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -18,7 +19,10 @@ from websockets.sync.client import connect
 from command_line import rlservo
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.robots.command_stream import Phase
+from rlservo.envs.ros2 import messages
 from rlservo.envs.ros2.base import BaseLimits, RosBase
+from rlservo.envs.ros2.link import Endpoint, Publish
+from rlservo.envs.ros2.rosbridge_link import RosbridgeLink
 from rlservo.envs.ros2.rosbridge_server import RosbridgeServer
 from rlservo.envs.ros2.simulated_base import SimulatedBase
 from rlservo.envs.ros2.simulation_loop import run
@@ -37,6 +41,7 @@ class RunningBase:
     base: SimulatedBase
     port: int
     seen: list[tuple[float, float, float]] = field(default_factory=list)  # time.monotonic(), x [m], speed [m/s]
+    commands: list[float] = field(default_factory=list)  # [m/s], that came
 
     @property
     def robot(self) -> str:
@@ -68,6 +73,13 @@ def base(request: pytest.FixtureRequest) -> Iterator[RunningBase]:
     running = RunningBase(SimulatedBase([bridge], world=world, is_stamped=is_stamped, faults=LinkFaults()), bridge.port)
     tick = running.base.tick
     running.base.tick = lambda: (tick(), running.watch())[0]  # type: ignore[method-assign]
+    command = running.base.simulation.command
+
+    def take(linear: float, angular: float) -> bool:
+        running.commands.append(linear)
+        return command(linear, angular)
+
+    running.base.simulation.command = take  # type: ignore[method-assign]
     stop, ready = threading.Event(), threading.Event()
     thread = threading.Thread(target=run, args=(running.base, stop, ready.set), name="simulated-base")
     thread.start()
@@ -197,6 +209,94 @@ def test_dead_mans_switch_must_be_held(base: RunningBase) -> None:
         press({"data": False})
         base.wait_until(lambda: (real.command(0.5, 0.0), base.seen[-1][2] < STANDS)[1])
         assert time.monotonic() - began < 0.2 + BRAKING_S
+    finally:
+        real.close()
+
+
+def test_person_drives_the_base_until_it_is_given_back(base: RunningBase) -> None:
+    env = gym.make(
+        "rlservo.envs:rlservo/NoObstacleNavigationMir100Rob-v0", robot=base.robot, confirm=False,
+        disable_env_checker=True, limits={"stop_distance": 0.0},
+    )  # fmt: skip
+    joystick = RosbridgeLink("127.0.0.1", base.port)
+    drive = joystick.advertise("/cmd_vel", "geometry_msgs/msg/Twist")
+    try:
+        env.reset(options={"target_pose": (30.0, 0.0, 0.0)})
+        robot: Any = env.unwrapped
+        stand = env.action_space.sample() * 0
+
+        def step() -> str:
+            drive(messages.twist(0.3, 0.0))
+            robot.simulation.hold()  # an episode's end, or a late answer of the policy's server
+            return str(env.step(stand)[-1]["robot"]["state"])
+
+        robot.take_over()
+        base.wait_until(lambda: step() == "human" and base.seen[-1][2] > FAST)
+        base.commands.clear()
+        base.wait_until(lambda: step() == "human" and len(base.commands) > 10)
+        assert set(base.commands) == {0.3}  # none of ours among the person's
+
+        env.reset(options={"target_pose": (-30.0, 0.0, 0.0)})
+        assert step() == "human"
+        assert set(base.commands) == {0.3}
+        robot.take_over()
+        base.wait_until(lambda: env.step(stand + 1.0)[-1]["robot"]["state"] == "run" and base.seen[-1][2] > FAST)
+    finally:
+        joystick.close()
+        env.close()
+
+
+class DriftingRobot:
+    """A link to a base whose clock differs from ours, and goes slower."""
+
+    SLOWER = 50e-6  # a usual quartz's
+
+    def __init__(self) -> None:
+        self.now, self.delay_s = 1000.0, 0.05
+        self._take: Callable[[Any], None] = lambda _: None
+
+    def now_s(self) -> float:
+        return self.now
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass without messages, then deliver one."""
+        self.now += seconds
+        made_s = (self.now - self.delay_s) * (1.0 - self.SLOWER) - 500.0
+        pose = {"position": {"x": 0.0, "y": 0.0}, "orientation": messages.quaternion(0.0)}
+        state = {"pose": {"pose": pose}, "twist": {"twist": {"linear": {"x": 0.0}, "angular": {"z": 0.0}}}}
+        self._take(messages.parse({"header": {"stamp": messages.stamp(made_s)}, **state}))
+
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
+        self._take = on_message
+        self.pass_time(0.0)
+
+    def advertise(self, topic: str, kind: str) -> Publish:
+        return lambda _: None
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        return []
+
+    rivals = publishers
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        return [Endpoint("/mir", messages.TWIST)]
+
+    def close(self) -> None:
+        pass
+
+
+def test_clock_that_drifts_for_hours_is_no_age_but_a_late_message_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = DriftingRobot()
+    monkeypatch.setattr("rlservo.envs.ros2.base.open_link", lambda *_: robot)
+    monkeypatch.setattr("rlservo.envs.ros2.link.DISCOVERY_S", 0.0)
+    real = RosBase("rosbridge://mir", limits=BaseLimits(stop_distance=0.0), needs_scan=False)
+    try:
+        for _ in range(3 * 3600):
+            robot.pass_time(1.0)
+        assert real.state().age_s < 0.01
+        robot.delay_s += 0.4
+        robot.pass_time(1.0)
+        assert real.state().age_s == pytest.approx(0.4, abs=0.01)
     finally:
         real.close()
 
