@@ -310,6 +310,8 @@ def _check_choices(
     moves: Callable[[], NDArray[np.float64]],
 ) -> None:
     """Compare discrete actions; a tie in its scores excuses a difference, and so do scores that are NaN."""
+    if np.array_equal(got, reference.outputs[output]):
+        return
     columns = _columns(reference.outputs[output])
     scored = choice_scores(recipe, reference.outputs).get(output) or [np.full((len(c), 1), np.inf) for c in columns]
     for part, (exported, wanted, scores) in enumerate(zip(_columns(got), columns, scored, strict=True)):

@@ -160,25 +160,19 @@ class NewStackLoop:
             else:
                 action, extra = self._last[row]
                 self.pipelines.advance(self._episodes[row], obs, action, float(rewards[row]), extra)
-        # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray 2.60):
-        # there, it acts for one at a time.
-        alone = is_nested(self._recipe.action_space)
-        groups = [[row] for row in range(len(rows))] if alone else [list(range(len(rows)))]
-        self._last = []
-        outputs = [self._decide([self._episodes[row] for row in group]) for group in groups]
-        return {name: np.concatenate([one[name] for one in outputs]) for name in outputs[0]}
-
-    def _decide(self, episodes: list[Any]) -> Outputs:
-        """Return RLlib's outputs for these episodes, and keep the state for the next step."""
-        batch, shared = self.pipelines.to_module(episodes)
+        batch, shared = self.pipelines.to_module(self._episodes)
         forward = self.pipelines.forward(batch)
         outputs = self._outputs(batch, forward)
-        columns = self.pipelines.to_env(forward, episodes, shared)
+        if is_nested(self._recipe.action_space):
+            # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray
+            # 2.60). No action depends on it.
+            forward.setdefault(Columns.ACTION_LOGP, torch.zeros(len(rows)))
+        columns = self.pipelines.to_env(forward, self._episodes, shared)
         # The episodes remember the module's own actions; the environment gets those that have been scaled.
         own = columns.pop(Columns.ACTIONS)
         action = columns.pop(Columns.ACTIONS_FOR_ENV, own)
-        self._last += [
-            (_pick(own, row), {key: values[row] for key, values in columns.items()}) for row in range(len(episodes))
+        self._last = [
+            (_pick(own, row), {key: values[row] for key, values in columns.items()}) for row in range(len(rows))
         ]
         actions = {name: np.asarray(leaf) for name, leaf in named_leaves(action, "action").items()}
         return {**actions, **outputs}

@@ -112,6 +112,11 @@ def test_the_memory_of_a_policy_of_images_is_proven_in_fewer_steps() -> None:
             restarts = [batch.restart for batch in batches if len(batch) == size]
             assert all(restart is not None for restart in restarts)
             assert np.all(restarts[0]) and not np.all(restarts[1])  # some go on with their state
+    assert {batch.kind for batch in few} == {batch.kind for batch in many} == {"likely", "wide", "extreme"}
+    assert sum(len(batch) for batch in many) > 1400
+    pairs = np.stack([batch.restart for batch in many if batch.restart is not None and len(batch) == 2])
+    last = np.flatnonzero(pairs[:, 0])[-1]
+    assert len(pairs) - last > 90 and pairs[last + 1 :, 1].any()  # one row remembers, the other begins again beside it
 
 
 def test_connectors_that_an_environment_elsewhere_has_are_built_from_the_configuration(
