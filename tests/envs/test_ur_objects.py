@@ -7,8 +7,6 @@ import math
 import mujoco
 import numpy as np
 import pytest
-from scipy import interpolate as scipy_interpolate
-from scipy import signal
 
 from rlservo.envs.ur.object_paths import interpolate, object_path
 from rlservo.envs.ur.simulation import URSimulation
@@ -31,6 +29,8 @@ def test_fixed_position_is_one_position() -> None:
 
 @pytest.mark.parametrize("frequency", [0.125, 0.3, 1.0, 7.0])
 def test_triangle_wave_is_scipys_sawtooth_at_100_hz(frequency: float) -> None:
+    from scipy import signal  # here: it takes a second
+
     path = path_of("triangle_wave", x=0.12, y=0.34, z_amplitude=0.2, z_frequency=frequency, z_offset=0.5)
     count = int(100 / frequency)
     t = np.linspace(0, 1 / frequency, count)
@@ -44,6 +44,8 @@ def test_triangle_wave_is_scipys_sawtooth_at_100_hz(frequency: float) -> None:
 
 @pytest.mark.parametrize("count", [4, 5, 10, 30])
 def test_spline_is_scipys_splprep(count: int) -> None:
+    from scipy import interpolate as scipy_interpolate
+
     points = np.random.default_rng(count).uniform(-1, 1, (count, 3))
     points[-1] = points[0]
     knots, _ = scipy_interpolate.splprep(points.T.tolist(), s=0)

@@ -14,7 +14,6 @@ from rlservo.export.contract.errors import CheckpointError, RlservoError, Unsupp
 from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.serve_app.runtime.policy import Policy
 
-leapp = pytest.importorskip("leapp")
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -23,6 +22,7 @@ onnxruntime = pytest.importorskip("onnxruntime")
 @pytest.fixture(scope="module", params=["jit-trace", "onnx-torchscript"])
 def bundle(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
     """An arm: joints and velocities are put side by side with the last action, then a network gives targets."""
+    leapp = pytest.importorskip("leapp")  # here: it imports all of torch's compiler
     folder = tmp_path_factory.mktemp("leapp")
     format = request.param
     torch.manual_seed(0)
@@ -60,6 +60,8 @@ def _only(tensors: Any) -> Any:
 
 
 def test_stages_are_chained_and_kinds_become_names_and_units(bundle: Path, tmp_path: Path, notices: list[str]) -> None:
+    import leapp
+
     result = export_checkpoint(bundle, tmp_path, notify=notices.append)
     contract = result.contract
     assert not any("loading" in notice for notice in notices)

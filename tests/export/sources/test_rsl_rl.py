@@ -17,9 +17,6 @@ from rlservo.serve_app.runtime.policy import Policy
 pytest.importorskip("rsl_rl")
 torch = pytest.importorskip("torch")
 
-from rsl_rl.runners import OnPolicyRunner  # noqa: E402
-from tensordict import TensorDict  # noqa: E402
-
 JOINTS = {"shoulder_pan_joint": 0.0, "shoulder_lift_joint": -1.712, "elbow_joint": 1.712}
 OBSERVED = 5
 
@@ -49,6 +46,9 @@ def environment(action: dict[str, Any], joint_pos: dict[str, float] | None = Non
 
 def train(folder: Path, agent: dict[str, Any], env: dict[str, Any] | None) -> Any:
     """Return a runner whose weights and statistics are saved in `folder`, as Isaac Lab's train.py leaves it."""
+    from rsl_rl.runners import OnPolicyRunner  # here: it imports all of torch's compiler
+    from tensordict import TensorDict
+
     torch.manual_seed(0)
     obs = TensorDict({"policy": torch.randn(6, OBSERVED), "privileged": torch.randn(6, 2)}, batch_size=[6])
     world = SimpleNamespace(num_envs=6, num_actions=3, device="cpu", cfg={}, get_observations=lambda: obs)
@@ -72,6 +72,8 @@ def train(folder: Path, agent: dict[str, Any], env: dict[str, Any] | None) -> An
 
 def raw_actions(runner: Any, episodes: list[Any]) -> list[Any]:
     """Return what the runner's own inference policy gives over episodes."""
+    from tensordict import TensorDict
+
     policy = runner.get_inference_policy()
     found = []
     for episode in episodes:
