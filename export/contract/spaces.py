@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
@@ -165,8 +164,6 @@ def leaf_specs(space: SpaceSpec, name: str) -> dict[str, LeafSpec]:
     return {path: leaf for key, child in inside.items() for path, leaf in leaf_specs(child, f"{name}.{key}").items()}
 
 
-def iter_elements(space: LeafSpec) -> Iterator[tuple[int, str]]:
-    """Yield (index, label) for error messages: the element's name where known, else its index."""
-    for index in range(space.size):
-        named = index < len(space.elements)
-        yield index, f"{index} ({space.elements[index].name})" if named else str(index)
+def element_label(space: LeafSpec, index: int) -> str:
+    """Return an element's label for error messages: its index in row-major order, with its name where known."""
+    return f"{index} ({space.elements[index].name})" if index < len(space.elements) else str(index)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.spaces import BoxSpec, iter_elements
+from rlservo.export.contract.spaces import BoxSpec, element_label
 
 FILTER = "mean_std_filter"
 EVERY = 16  # the arithmetic costs a few microseconds: too much for every step of a control loop
@@ -43,8 +43,9 @@ class Drift:
         if moments is None or not isinstance(space, BoxSpec):
             return None
         names = [element.name for element in space.elements]
-        labels = names if len(set(names)) == space.size else [label for _, label in iter_elements(space)]
-        return cls(tuple(labels), *moments)
+        if len(set(names)) != space.size:
+            names = [element_label(space, index) for index in range(space.size)]
+        return cls(tuple(names), *moments)
 
     def add(self, obs: NDArray[Any]) -> None:
         """Include checked observations `[batch, ...]`; a parser does this once in `EVERY` calls."""

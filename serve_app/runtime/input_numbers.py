@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import RequestError, RlservoError
-from rlservo.export.contract.spaces import LeafSpec, iter_elements
+from rlservo.export.contract.spaces import LeafSpec, element_label
 
 NUMBER_KINDS = "fiub"  # numpy dtype kinds: float, int, unsigned, bool (a flag such as in_collision is 0 or 1)
 LISTED = 8  # names listed in a message before "and N more"
@@ -28,7 +28,7 @@ def first_element(space: LeafSpec, bad: NDArray[np.bool_]) -> tuple[str, tuple[i
     """Return (label, index) of the first element for which `bad` `[batch, *shape]` is true."""
     index = tuple(int(i) for i in np.argwhere(bad)[0])
     flat = int(np.ravel_multi_index(index[1:], space.shape)) if space.shape else 0
-    return dict(iter_elements(space))[flat], index
+    return element_label(space, flat), index
 
 
 def to_array(given: Any) -> NDArray[Any]:
