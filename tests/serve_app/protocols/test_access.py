@@ -243,17 +243,21 @@ def bearer(key: str) -> tuple[bytes, ...]:
 
 
 def attempts(app: PolicyApp, kind: str) -> Iterator[tuple[bytes, bytes, str | None, Access]]:
-    """Yield (method, target, key, who may use it): with keys that do not suffice, or none."""
+    """Yield (method, target, key, who may use it): with keys that do not suffice, or none.
+
+    A byte that ends a connection ends it before a key is read: one of the keys, and the path's own method.
+    """
     for method, path, access in paths(app):
         if access is Access.admin:
-            keys, methods = [None, ROBOT, WRONG], {method, "POST"}
+            keys, methods = [None, WRONG, ROBOT], [method, *({"POST"} - {method})]
         elif kind == "keys":
-            keys, methods = [WRONG], {method}
+            keys, methods = [WRONG], [method]
         else:
             continue
-        for key in keys:
-            for target in spellings(path):
-                for verb in sorted(methods):
+        for target in spellings(path):
+            formed = WELL_FORMED.fullmatch(target)
+            for key in keys if formed else keys[-1:]:
+                for verb in methods if formed else methods[:1]:
                     yield verb.encode(), target, key, access
 
 
