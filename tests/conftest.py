@@ -37,6 +37,9 @@ pytest_plugins = [
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {
     "tests/envs/robot_server/": "ports of server managers",
+    "tests/export/graph/test_operators.py": "torch's compiler",  # imports it
+    "tests/export/sources/test_leapp.py": "torch's compiler",
+    "tests/export/sources/test_rsl_rl.py": "torch's compiler",
     "tests/system/test_behind_nginx.py": "live server",
     "tests/system/test_prometheus.py": "live server",
     "tests/system/test_serving.py": "live server",
@@ -48,6 +51,7 @@ TOGETHER = {
     "tests/system/test_served_policies.py": "shipped server",
     "tests/system/test_both_engines.py": "cluster",
     "tests/system/test_shared_sessions.py": "cluster",
+    "tests/system/test_documents_run.py::test_guide_to_online_learning": "one Ray",
     "tests/benchmarks/test_training_benchmark.py": "one Ray",
     "tests/examples/test_edge_environments.py": "one Ray",
     "tests/examples/test_learn_from_recordings.py": "one Ray",
