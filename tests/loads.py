@@ -29,6 +29,8 @@ class Load:
     expected: Sequence[NDArray[Any]]
     """The actions that are right: one for each version that may answer."""
     api_key: str | None = None
+    pause_s: float = 0.005
+    """After each of a client's requests [s]."""
     asked: int = 0
     failures: list[str] = field(default_factory=list)
     wrong: int = 0
@@ -57,4 +59,4 @@ class Load:
                 else:
                     self.wrong += not any(np.array_equal(action, right) for right in self.expected)
                 self.asked += 1
-                time.sleep(0.005)
+                time.sleep(self.pause_s)

@@ -144,7 +144,10 @@ def test_a_worker_that_is_killed_or_stopped_is_replaced_under_load(
     with load.run():
         time.sleep(1)
         os.kill(before[0], number)
+        time.sleep(1)
+        load.pause_s = 0.1  # that a worker is stopped is noticed after 30 s
         wait_for(lambda: before[0] not in (now := worker_pids(run)) and len(now) == 2)
+        load.pause_s = Load.pause_s
         time.sleep(2)
     assert load.asked > 100 and load.wrong == 0
     # A stopped worker keeps its clients waiting up to their own time limit; then they ask another one.
