@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import pty
 import re
@@ -78,10 +79,16 @@ def commands(text: str) -> list[str]:
     return [line for line in re.sub(r"\\\n\s*", "", text).splitlines() if line and not line.startswith("#")]
 
 
+@functools.cache
+def command_line() -> Any:
+    """Return the definition of `rlservo`, which takes a while to make of its functions."""
+    return typer.main.get_command(app)
+
+
 def unknown_options(line: str) -> list[str]:
     """Return what `rlservo` does not know of a line's words, by its own definition of the command."""
     words = line.split("#")[0].split()
-    command: Any = typer.main.get_command(app)
+    command = command_line()
     for word in words[1:]:
         part = getattr(command, "commands", {}).get(word)
         if part is None:
