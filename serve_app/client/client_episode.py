@@ -43,10 +43,6 @@ class ClientEpisode:
         """Return whether requests carry a `state`."""
         return not self.is_on_server(contract) and (bool(contract.state) or self._is_limited)
 
-    def is_bound(self, contract: Contract) -> bool:
-        """Return whether the episode's memory is of this policy's version."""
-        return bool(contract.state) and self._steps > 0
-
     def carry(self) -> None:
         """Send a `state` from now on, since the server has refused a request without one."""
         self._is_limited = True
@@ -60,8 +56,13 @@ class ClientEpisode:
         self._is_last_action_known = False
         self._is_lost = self._steps > 0
 
-    def request_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any]:
-        """Return the next request's fields on the episode.
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was an action since `reset`."""
+        return self._steps > 0
+
+    def request_fields(self, contract: Contract, batch: tuple[int, ...], *, ends: bool = False) -> dict[str, Any]:
+        """Return the next request's fields on the episode; `ends` if it reports the end.
 
         Before its reply, the server may have decided an action that never reached the robot.
 
@@ -77,6 +78,7 @@ class ClientEpisode:
                     self._session_id = uuid.uuid4().hex
                 self._has_unanswered_start = self._steps == 0
                 fields["session_id"] = self._session_id
+                fields |= {"end": True} if ends else {}
         elif self.is_carried(contract):
             fields["state"] = self._state
         elif self._is_stream and self._steps == 0:
@@ -85,18 +87,6 @@ class ClientEpisode:
         if has_last_action and not self._is_last_action_known and is_action(self._last_action, batch, contract):
             fields["last_action"] = self._last_action
         self._is_last_action_known = False
-        return fields
-
-    def end_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any] | None:
-        """Return the fields of a request that reports the episode's end; None if there is nothing to end.
-
-        Raises SessionLostError.
-        """
-        if self._steps == 0:
-            return None
-        fields = self.request_fields(contract, batch)
-        if self._session_id is not None:
-            fields["end"] = True
         return fields
 
     def end(self) -> None:

@@ -53,12 +53,21 @@ class DroppedError(UnavailableError):
 class Transport:
     """A keep-alive connection to one server, or a pool of them if several threads call. Thread-safe."""
 
-    def __init__(self, url: str, *, timeout_s: float, retries: int, api_key: str | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        timeout_s: float,
+        retries: int,
+        api_key: str | None = None,
+        schemes: Mapping[str, str] = SCHEMES,
+    ) -> None:
         """Check the arguments; nothing is sent before the first call.
 
-        `api_key` travels as `Authorization: Api-Key <key>`, as openpi's clients send it.
+        `api_key` travels as `Authorization: Api-Key <key>`, as openpi's clients send it. `schemes` has the connection's
+        scheme for each one that an address may have.
         """
-        self.url = parse_address(url, SCHEMES)
+        self.url = parse_address(url, schemes)
         if not timeout_s > 0:
             raise UsageError(f"timeout_s must be above 0 seconds, got {timeout_s}")
         if retries < 0:
@@ -106,6 +115,11 @@ class Transport:
         """Send a JSON document and return the JSON answer."""
         return self._parse(*self._call("POST", path, body, timeout_s, None))
 
+    def check_open(self) -> None:
+        """Raise UsageError after `close`."""
+        if self._is_closed:
+            raise UsageError("the client is closed: create a new one")
+
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
         self._is_closed = True
@@ -120,8 +134,7 @@ class Transport:
         UnavailableError if the server cannot be reached or keeps answering 503, or a gateway 500 or 502, and otherwise
         the error that the server names.
         """
-        if self._is_closed:
-            raise UsageError("the client is closed: create a new one")
+        self.check_open()
         url = "/".join((self.url, *(quote(part, safe="") for part in path)))
         scheme, host, port, prefix = self._address
         target = "/".join((prefix, *(quote(part, safe="") for part in path))) or "/"
