@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import uuid
 from collections.abc import Mapping
 from typing import Any
@@ -31,7 +32,7 @@ class ClientEpisode:
         """Start an episode."""
         self._state: dict[str, Any] = {}  # empty at an episode's start
         self._steps = 0
-        self._last_action: Any = None  # in the server's form
+        self._last_action: Any = None
         self._is_last_action_known = True  # whether the server has the same action
         self._is_lost = False
 
@@ -96,7 +97,7 @@ class ClientEpisode:
             self._session_id = uuid.uuid4().hex
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
-        """Advance to the next step after a reply; `action` is the reply's, in the form for sending.
+        """Advance to the next step after a reply; `action` is the reply's.
 
         Raises SessionLostError when the reply belongs to another episode, UnavailableError when it lacks the state.
         """
@@ -107,4 +108,4 @@ class ClientEpisode:
             if self.is_carried(contract):
                 self._state = next_state(reply, contract)
             self._steps += 1
-        self._last_action, self._is_last_action_known = action, True
+        self._last_action, self._is_last_action_known = copy.deepcopy(action), True  # the loop may write into its own

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import StateNeededError, UsageError
 from rlservo.serve_app.client.client_episode import ClientEpisode
 from rlservo.serve_app.client.http_transport import Transport, encode
@@ -112,6 +110,3 @@ class PolicyClient(RemotePolicy):
                 # The contract does not say whether the server limits the step from one action to the next.
                 episode.carry()
                 left_ms = 1e3 * (deadline - time.monotonic())
-
-    def _action_of(self, reply: Mapping[str, Any], batch: tuple[int, ...], contract: Contract) -> Any:  # noqa: ARG002
-        return reply.get("action")

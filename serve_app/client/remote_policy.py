@@ -11,7 +11,6 @@ import itertools
 import logging
 import time
 from abc import abstractmethod
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -198,20 +197,14 @@ class RemotePolicy(ActingPolicy):
         request, batch = self._encode_request(obs, explore=explore, seed=seed, reward=reward)
         reply = self._exchange(request, batch, deadline, ends=False)
         contract = self._answering_contract(reply, request["seq"], deadline)
-        sent = self._action_of(reply, batch, contract)
-        action = decode_action(sent, batch, contract)
-        self._episode.advance(reply, sent, contract)
+        action = decode_action(reply, batch, contract)
+        self._episode.advance(reply, action, contract)
         self.last_reply, self._reward = reply, None
         return action
 
     @abstractmethod
     def _exchange(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float, *, ends: bool) -> Any:
         """Send a request with the episode's fields by `deadline` (`time.monotonic`), and return the reply."""
-        ...
-
-    @abstractmethod
-    def _action_of(self, reply: Mapping[str, Any], batch: tuple[int, ...], contract: Contract) -> Any:
-        """Return the action in a reply, in the form for sending."""
         ...
 
     def _find_name(self, timeout_s: float | None, retries: int | None) -> str:
@@ -234,21 +227,20 @@ class RemotePolicy(ActingPolicy):
         return self._parse_contract(self._transport.get(*path, timeout_s=timeout_s, retries=0))
 
     def _meet(self, contract: Contract) -> None:
-        """Use this contract from now on. Raises UnavailableError."""
-        self._learn(contract)
-        if self._contract is not None and contract is not self._contract:
-            check_successor(contract, self._contract)
-        self._contract, self._looks_up = contract, False
+        """Use this contract from now on; warn if its version was made for another control rate.
 
-    def _learn(self, contract: Contract) -> None:
-        """Store the contract of a version; warn if it was made for another control rate."""
+        Raises UnavailableError if its observations or actions are others.
+        """
         known = self._contract
         if contract.version not in self._contracts and known and known.control_rate_hz != contract.control_rate_hz:
             logger.warning(
                 "version %s of policy '%s' was made for %s Hz, but version %s for %s Hz",
                 contract.version, contract.name, contract.control_rate_hz, known.version, known.control_rate_hz,
             )  # fmt: skip
-        self._contracts.setdefault(contract.version, contract)
+        self._contracts.setdefault(contract.version, contract)  # also if it is refused: it is fetched once
+        if known is not None and contract is not known:
+            check_successor(contract, known)
+        self._contract, self._looks_up = contract, False
 
     def _answering_contract(self, reply: Any, number: int, deadline: float) -> Contract:
         """Return the contract of the version that answered request `number`.
@@ -273,7 +265,6 @@ class RemotePolicy(ActingPolicy):
                     f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' but has no contract "
                     "for it: the action was dropped"
                 )
-            self._learn(known)  # kept even if it is refused next, so that it is not fetched again
         self._meet(known)
         return known
 

@@ -9,23 +9,12 @@ from __future__ import annotations
 import json
 import secrets
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-import numpy as np
-
 from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import (
-    ActionError,
-    DeadlineError,
-    RequestError,
-    RlservoError,
-    StateNeededError,
-    UnavailableError,
-)
-from rlservo.export.contract.nested import action_leaves, build_action
+from rlservo.export.contract.errors import DeadlineError, RlservoError, StateNeededError, UnavailableError
 from rlservo.serve_app.client.client_episode import ClientEpisode
 from rlservo.serve_app.client.http_transport import Transport
 from rlservo.serve_app.client.remote_policy import RemotePolicy
@@ -200,24 +189,7 @@ class StreamClient(RemotePolicy):
         self._connected(contract, deadline)
         return contract
 
-    def _action_of(self, reply: Mapping[str, Any], batch: tuple[int, ...], contract: Contract) -> Any:
-        return _first_of_chunk(reply.get("actions"), contract, batch)
-
     def _disconnect(self) -> None:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-
-
-def _first_of_chunk(chunks: Any, contract: Contract, batch: tuple[int, ...]) -> Any:
-    """Return the action without the chunk axis of each leaf; our chunks have one action. Raises ActionError."""
-    leaves: dict[str, Any] = {}
-    try:
-        for name, chunk in action_leaves(contract.action_space, chunks).items():
-            array = np.asarray(chunk)
-            if array.ndim <= len(batch) or array.shape[len(batch)] != 1:
-                raise ActionError(f"the server's {name} has shape {array.shape}: expected a chunk of one action")
-            leaves[name] = array[:, 0] if batch else array[0]
-    except (RequestError, ValueError) as error:
-        raise ActionError(f"the server's action for {contract.name!r} cannot be read: {error}") from error
-    return build_action(contract.action_space, leaves)
