@@ -13,6 +13,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from functools import partial
 from typing import Any, TypeVar
 
@@ -46,43 +47,35 @@ class BlockingCalls:
                 f"{what} could not start within {timeout_s:g} s: {self._limit} earlier calls have not come back "
                 "from the file system"
             ) from None
-        returned = self._start(function, arguments)
-        try:
-            done: set[asyncio.Future[Result]] = set()
-            while not done and (timeout_s is None or time.monotonic() - began < timeout_s):
-                left_s = SILENCE_S if timeout_s is None else timeout_s - (time.monotonic() - began)
-                done, _ = await asyncio.wait([returned], timeout=min(SILENCE_S, left_s))
-                if not done and left_s >= SILENCE_S:
-                    logger.warning("waiting for %s (%.0f s)", what, time.monotonic() - began)
-        finally:
-            returned.cancel()  # if it has not returned, its result is no longer wanted
-        if not done:
-            raise UnavailableError(
-                f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?"
-            )
-        return returned.result()
-
-    def _start(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> asyncio.Future[Result]:
         loop = asyncio.get_running_loop()
-        returned: asyncio.Future[Result] = loop.create_future()
-
-        def call() -> None:
-            settle: Callable[[], None]
-            try:
-                settle = partial(returned.set_result, function(*arguments))
-            except BaseException as error:
-                settle = partial(returned.set_exception, error)
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(finish, settle)
-
-        def finish(settle: Callable[[], None]) -> None:
-            self._free.release()
-            if not returned.cancelled():
-                settle()
-
+        outcome: Future[Result] = Future()
+        outcome.set_running_or_notify_cancel()  # the call goes on if its caller gives up
+        outcome.add_done_callback(partial(self._release, loop))
         try:  # a daemon thread, so that the process can end while it is stuck
-            threading.Thread(target=call, name="policies", daemon=True).start()
+            threading.Thread(target=_call, args=(outcome, function, *arguments), name="policies", daemon=True).start()
         except RuntimeError:  # there are too many in this process
             self._free.release()
             raise
-        return returned
+        returned = asyncio.wrap_future(outcome)
+        try:
+            while timeout_s is None or time.monotonic() - began < timeout_s:
+                left_s = SILENCE_S if timeout_s is None else timeout_s - (time.monotonic() - began)
+                done, _ = await asyncio.wait([returned], timeout=min(SILENCE_S, left_s))
+                if done:
+                    return returned.result()
+                if left_s >= SILENCE_S:
+                    logger.warning("waiting for %s (%.0f s)", what, time.monotonic() - began)
+        finally:
+            returned.cancel()  # if it has not returned, its result is no longer wanted
+        raise UnavailableError(f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?")
+
+    def _release(self, loop: asyncio.AbstractEventLoop, _outcome: Future[Any]) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(self._free.release)
+
+
+def _call(outcome: Future[Result], function: Callable[..., Result], *arguments: Any) -> None:
+    try:
+        outcome.set_result(function(*arguments))
+    except BaseException as error:
+        outcome.set_exception(error)

@@ -101,7 +101,7 @@ class PlanFollower:
 
     async def follow(self) -> None:
         """Serve the newest plan if another one is served, and try again what could not be loaded a while ago."""
-        plan = await self._writer.after(self._generation())
+        plan = await self._files.call(self._files.after, self._generation())
         if self._failed and time.monotonic() - self._tried_at > RETRY_PERIOD_S and self._try_again():
             plan = plan or self.plan
         if plan is not None:
