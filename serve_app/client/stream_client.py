@@ -18,8 +18,8 @@ from rlservo.export.contract.errors import DeadlineError, RlservoError, StateNee
 from rlservo.serve_app.client.client_episode import ClientEpisode
 from rlservo.serve_app.client.http_transport import Transport
 from rlservo.serve_app.client.remote_policy import RemotePolicy
-from rlservo.serve_app.client.replies import decode_error, error_of
-from rlservo.serve_app.client.websocket_connection import BrokenError, HandshakeError, WebSocket
+from rlservo.serve_app.client.replies import error_of
+from rlservo.serve_app.client.websocket_connection import BrokenError, WebSocket
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 if TYPE_CHECKING:
@@ -72,10 +72,10 @@ class StreamClient(RemotePolicy):
             episode=ClientEpisode(server_state=server_state, is_stream=True),
             record=record,
         )
-        self._timeout_s, self._api_key = timeout_s, api_key
+        self._timeout_s = timeout_s
+        transport.label = secrets.token_hex(8)  # during a canary, all its connections get the same version
         self._socket: WebSocket | None = None
         self._path = ""  # that of the last connection
-        self._label = secrets.token_hex(8)
         self._connections = 0
         self.stale = 0
         """Answers that came after their deadline and were dropped."""
@@ -87,8 +87,8 @@ class StreamClient(RemotePolicy):
 
     def close(self) -> None:
         """Close the connection, as `RemotePolicy.close`."""
-        super().close()
         self._disconnect()
+        super().close()
 
     def _exchange(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float, *, ends: bool) -> Any:
         is_version_new = False
@@ -161,12 +161,7 @@ class StreamClient(RemotePolicy):
     def _open(self, path: str, deadline: float) -> tuple[WebSocket, dict[str, Any]]:
         """Return an open connection, and the metadata that it began with."""
         self._transport.check_open()
-        try:
-            connection = WebSocket(
-                f"{self.url}{path}?errors=keep", api_key=self._api_key, deadline=deadline, label=self._label
-            )
-        except HandshakeError as error:
-            raise decode_error(self.url, error.status, error.body) from None
+        connection = WebSocket(self._transport, f"{path}?errors=keep", deadline)
         try:
             metadata = self._receive(connection, deadline)
             if (error := error_of(metadata, 500)) is not None:
