@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.contract.errors import BundleError, CheckpointError, ParityError, UnsupportedError, UsageError
-from rlservo.serve_app.learning.admission import Admission, Admitted, KnownVersion
+from rlservo.serve_app.learning.admission import Admission, Admitted
 from rlservo.serve_app.learning.following import FollowedRecordings
 from rlservo.serve_app.learning.release import Release
 from rlservo.serve_app.learning.rllib_episodes import single_agent_episode
@@ -59,8 +59,7 @@ class OnlineLearning:
         state = self._run.state
         if self._run.is_new:
             self._release.check_unclaimed()
-            self._keep(self._release.publish(self._learner.save))
-            self._say(f"version {state.versions[-1].version} is the checkpoint itself")
+            self._make_version()  # the checkpoint itself
         else:
             self._learner.restore(self._run.checkpoint(state.versions[-1].version))
             self._serve_newest()
@@ -75,29 +74,27 @@ class OnlineLearning:
     # Versions.
 
     def _make_version(self) -> bool:
-        """Release the learned version; return whether robots get it. If not, continue from the last version."""
+        """Release the learned version; return whether robots get it. If not, continue from the last version.
+
+        Raises the gate's error or UsageError if it is the first.
+        """
+        state = self._run.state
         try:
-            known = self._release.publish(self._learner.save)
+            state.versions.append(self._release.publish(self._learner.save))
         except GATE as error:
+            if not state.versions:
+                raise
             self._refuse(f"the gate refused it: {error.message}")
             return False
-        if not self._keep(known):
-            return False
-        self._say(f"version {known.version} is proven, published and loaded after {self._run.state.updates} updates")
-        return True
-
-    def _keep(self, known: KnownVersion) -> bool:
-        """Record a version, and serve it to robots; return whether they get it."""
-        state = self._run.state
-        state.versions.append(known)
         self._run.commit(self._recordings.names())
         if not self._serve_newest():
             return False
-        self._forget_unproven()
+        self._unproven, self._fresh = [], 0
         too_old = len(state.versions) - self._admission.max_age - KEPT_LOADED
         if too_old > 0:
-            old = state.versions[too_old - 1].version
-            self._release.unload(old)
+            self._release.unload(state.versions[too_old - 1].version)
+        newest = state.versions[-1].version
+        self._say(f"version {newest} is proven, published and loaded after {state.updates} updates")
         return True
 
     def _serve_newest(self) -> bool:
@@ -124,14 +121,10 @@ class OnlineLearning:
         self._say(f"no version was released: {why}")
         self._learner.restore(self._run.checkpoint(newest), forget=self._fresh)
         state.unproven += self._unproven
-        self._forget_unproven()
+        self._unproven, self._fresh = [], 0
         state.refused += 1
         self._run.commit(self._recordings.names())
         self._say(f"learning continues from version {newest}")
-
-    def _forget_unproven(self) -> None:
-        self._unproven.clear()
-        self._fresh = 0
 
     # Updates.
 

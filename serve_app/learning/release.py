@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -23,7 +23,6 @@ from rlservo.export.contract.errors import (
 from rlservo.export.export_checkpoint import export_checkpoint, silent
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.promotion import INTERRUPTED, PROMOTED, ROLLED_BACK, Promotion, Terms
-from rlservo.serve_app.client.promotion_evidence import Limits
 from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.interface import PRODUCTION
 from rlservo.serve_app.learning.admission import KnownVersion, Reward, named_reward
@@ -32,20 +31,10 @@ from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.repository.publication import next_version, publish
 
 RETRY_S = 2.0
+EVERY_S = 5.0  # between two checks of a canary
 ATTEMPTS = 5  # to get a version number, each after another publisher has taken one
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Canary:
-    """Conditions under which a version is watched before all robots get it."""
-
-    share: float
-    """Share of the sessions."""
-    seconds: float
-    limits: Limits
-    every_s: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -56,8 +45,8 @@ class Target:
     repository: str
     """A folder or URI, one of the server's repositories."""
     alias: str
-    canary: Canary | None = None
-    """If given, versions go to production through a canary, and no alias is moved."""
+    canary: Terms | None = None
+    """If given, versions go to production by promotions on these terms, and no alias is moved."""
 
 
 class Release:
@@ -69,14 +58,13 @@ class Release:
         run: RunFolder,
         connect: Callable[[], AdminClient],
         *,
-        url: str,
         app_dir: Path,
         progress: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`connect` makes a client of `url` with the current admin key; `progress` takes the current activity."""
+        """`connect` makes a client of the server with the current admin key; `progress` takes the current activity."""
         self._target, self._run, self._connect = target, run, connect
-        self._url, self._reward = url, ""
+        self._reward = ""
         self._app_dir, self._progress, self._sleep = app_dir, progress, sleep
 
     def named_reward(self) -> Reward | None:
@@ -172,17 +160,17 @@ class Release:
         with self._connect() as client:
             client.alias(name, alias, version, expected=there)
 
-    def _promote(self, version: str, canary: Canary) -> str | None:
+    def _promote(self, version: str, terms: Terms) -> str | None:
         """Put a version into production as `rlservo policy promote` does, resuming from its log."""
-        name, log = self._target.policy, self._run.path / "promotions" / f"{version}.jsonl"
+        log = self._run.path / "promotions" / f"{version}.jsonl"
         if self._until_reached(lambda: self._aliases().get(PRODUCTION)) == version:
             return None
-        terms = Terms((self._url,), name, version, canary.share, canary.seconds, canary.limits)
+        terms = replace(terms, version=version)
         log.parent.mkdir(exist_ok=True)
         with PromotionLog.open(log) as opened:
             try:
                 outcome = Promotion(
-                    lambda _url: self._connect(), terms, opened, every_s=canary.every_s, say=self._progress
+                    lambda _url: self._connect(), terms, opened, every_s=EVERY_S, say=self._progress
                 ).run()
             except UsageError as error:  # for example another learner's canary
                 raise ConflictError(f"version {version} was not promoted: {error.message}") from None
