@@ -78,7 +78,6 @@ class PlanFollower:
                 plan.changed_by,
             )
         await self._apply(plan)
-        self._loader.proven = ()
 
     async def give(self, command: Command, name: str, *, by: str = "") -> Plan:
         """Carry out a command as `PlanWriter.give` does; return the plan when this process serves it."""
@@ -91,7 +90,6 @@ class PlanFollower:
             raise
         self._try_again()
         await self._apply(plan)
-        self._loader.proven = ()  # the store holds those of them that are served
         return plan
 
     def _generation(self) -> int:
@@ -205,7 +203,7 @@ class PlanFollower:
         if self.plan is not None and plan.generation < self.plan.generation:
             return  # a later plan has been served while this one was loading
         serving: dict[str, PolicyPlan] = {}
-        kept: list[Policy] = []
+        kept: dict[Loadable, Policy] = {}
         for name, wanted in plan.policies.items():
             keys = [(name, version, digest) for version, digest in wanted.versions.items()]
             errors = {key[1]: error for key in keys if isinstance(error := found[key], RlservoError)}
@@ -221,11 +219,15 @@ class PlanFollower:
                     f"{plan.generation} of {self._files.place}: {errors[wanted.default].message}"
                 )
             serving[name] = wanted
-            kept += [policy for key in keys if (policy := self._loader.get(*key)) is not None]
-        for policy in kept:
+            for key in keys:
+                policy = found.get(key) or self._loader.get(*key)
+                if policy is not None and not isinstance(policy, RlservoError):
+                    kept[key] = policy
+        self._loader.keep(kept)
+        for policy in kept.values():
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
-        self.store = PolicyStore(kept, serving, changed=changed)
+        self.store = PolicyStore(kept.values(), serving, changed=changed)
         self.plan = plan
         self._failed = {key: each for key, each in found.items() if isinstance(each, RlservoError)}
         if self._failed:

@@ -58,10 +58,10 @@ class PlanWriter:
         RefusedError if a version cannot be served, UnavailableError if something could not be read or written, and
         ConflictError if another command changed the same alias, version, canary or shadow at the same time.
         """
-        by = by or command.line(name)
         try:
             if isinstance(command, Load):
                 command = Load.of(*(await self._loader.look()).find(name, command.version))
+            by = by or command.line(name)
             before = await self._files.call(self._files.newest)
             if (before.generation if before is not None else 0) < known:
                 raise UnavailableError(f"{self._files.place} has lost plan {known}, which is served here")
