@@ -93,7 +93,7 @@ class RemotePolicy(ActingPolicy):
         server has several.
         """
         if self._contract is None or self._looks_up:
-            self._meet(self._fetch_contract(None))
+            self._meet(self._fetch_contract(self._version, None))
             assert self._contract is not None
         return self._contract
 
@@ -182,7 +182,7 @@ class RemotePolicy(ActingPolicy):
         while self._contract is None:
             remaining = deadline - time.monotonic()
             try:
-                self._meet(self._fetch_contract(max(min(remaining, LONGEST_TRY_S), 0.01)))
+                self._meet(self._fetch_contract(self._version, max(min(remaining, LONGEST_TRY_S), 0.01)))
             except (UnavailableError, DeadlineError) as error:
                 if time.monotonic() + POLL_S >= deadline:
                     raise UnavailableError(
@@ -211,20 +211,19 @@ class RemotePolicy(ActingPolicy):
         """Return the name of the server's only policy."""
         return _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s, retries=retries))
 
-    def _fetch_contract(self, timeout_s: float | None) -> Contract:
-        """Request the contract: once if there is a time-out, otherwise with the client's usual retries."""
+    def _fetch_contract(self, version: str | None, timeout_s: float | None) -> Contract:
+        """Request a contract: once if there is a time-out, otherwise with the client's usual retries."""
         retries = None if timeout_s is None else 0
-        name = self._name or self._find_name(timeout_s, retries)
-        version = () if self._version is None else ("versions", self._version)
-        return self._parse_contract(
-            self._transport.get("v1", "policies", name, *version, timeout_s=timeout_s, retries=retries)
-        )
-
-    def _fetch_version(self, version: str, deadline: float) -> Contract:
-        """Request the contract of a version, by `deadline` (`time.monotonic`)."""
-        path = ("v1", "policies", self.contract.name, "versions", version)
-        timeout_s = max(deadline - time.monotonic(), 0.001)
-        return self._parse_contract(self._transport.get(*path, timeout_s=timeout_s, retries=0))
+        name = self._name or (self._contract.name if self._contract else self._find_name(timeout_s, retries))
+        path = ("v1", "policies", name, *(() if version is None else ("versions", version)))
+        document = self._transport.get(*path, timeout_s=timeout_s, retries=retries)
+        try:
+            return Contract.model_validate(document)
+        except ValidationError as error:
+            raise UnavailableError(
+                f"{self.url} sent a contract that this client cannot read: {first_fault(error)} "
+                "(does the server run another version of rlservo?)"
+            ) from error
 
     def _meet(self, contract: Contract) -> None:
         """Use this contract from now on; warn if its version was made for another control rate.
@@ -273,7 +272,7 @@ class RemotePolicy(ActingPolicy):
         until = min(deadline, time.monotonic() + FOLLOWED_S)
         while True:
             try:
-                return self._fetch_version(version, deadline)
+                return self._fetch_contract(version, max(deadline - time.monotonic(), 0.001))
             except UnknownVersionError as error:
                 if time.monotonic() + ASK_AGAIN_S >= until:
                     raise UnavailableError(f"{error.message}: the action was dropped", error.details) from error
@@ -294,16 +293,6 @@ class RemotePolicy(ActingPolicy):
         elif self._reward is not None:
             request["reward"] = self._reward
         return request, batch
-
-    def _parse_contract(self, document: Any) -> Contract:
-        """Return the contract that the server sent. Raises UnavailableError if it is not one."""
-        try:
-            return Contract.model_validate(document)
-        except ValidationError as error:
-            raise UnavailableError(
-                f"{self.url} sent a contract that this client cannot read: {first_fault(error)} "
-                "(does the server run another version of rlservo?)"
-            ) from error
 
 
 def _only_policy(listing: Any) -> str:

@@ -108,7 +108,7 @@ class StreamClient(RemotePolicy):
                     raise
                 is_version_new = True  # and remembers: only a new connection has a memory
                 self._disconnect()
-                self._meet(self._fetch_contract(max(deadline - time.monotonic(), 0.001)))
+                self._meet(self._fetch_contract(self._version, max(deadline - time.monotonic(), 0.001)))
             except DeadlineError:
                 silent_s = time.monotonic() - connection.last_receive_at
                 if silent_s > max(SILENT_S, SILENT_FACTOR * self._deadline_ms / 1e3):
@@ -177,10 +177,10 @@ class StreamClient(RemotePolicy):
         connection.close()
         return str(metadata.get("policy"))
 
-    def _fetch_contract(self, timeout_s: float | None) -> Contract:
+    def _fetch_contract(self, version: str | None, timeout_s: float | None) -> Contract:
         """Also open the connection, so that no `act` waits for it."""
         deadline = time.monotonic() + (timeout_s or self._timeout_s)
-        contract = super()._fetch_contract(timeout_s)
+        contract = super()._fetch_contract(version, timeout_s)
         self._connected(contract, deadline)
         return contract
 

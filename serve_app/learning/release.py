@@ -72,13 +72,8 @@ class Release:
 
         None if it names none. Raises UsageError if it cannot be loaded.
         """
-
-        def ask() -> str:
-            with self._connect() as client:
-                return str(client.contract(self._target.policy).get("reward", ""))
-
         with suppress(UnknownPolicyError):  # not served before its first version
-            self._reward = self._until_reached(ask)
+            self._reward = self._ask(lambda client: str(client.contract(self._target.policy).get("reward", "")))
         return named_reward(self._reward) if self._reward else None
 
     def publish(self, save: Callable[[Path], None]) -> KnownVersion:
@@ -107,7 +102,7 @@ class Release:
     def check_unclaimed(self) -> None:
         """Raise ConflictError if a new run's alias already points to a version, as another learner may move it."""
         name, alias = self._target.policy, self._target.alias
-        there = None if self._target.canary else self._until_reached(lambda: self._aliases().get(alias))
+        there = None if self._target.canary else self._aliases().get(alias)
         if there is not None:
             raise ConflictError(
                 f"alias '{alias}' of policy '{name}' already points to version {there}: is another learner moving it? "
@@ -122,12 +117,12 @@ class Release:
         alias.
         """
         try:
-            self._until_reached(lambda: self._load(version))
+            self._ask(lambda client: client.load(self._target.policy, version))
         except RefusedError as error:
             return error.message
         if self._target.canary is not None:
             return self._promote(version, self._target.canary)
-        self._until_reached(lambda: self._move(version, before))
+        self._move(version, before)
         return None
 
     def unload(self, version: str) -> None:
@@ -138,14 +133,9 @@ class Release:
         except RlservoError as error:
             self._progress(f"version {version} stays loaded: {error.message}")
 
-    def _load(self, version: str) -> None:
-        with self._connect() as client:
-            client.load(self._target.policy, version)
-
     def _aliases(self) -> dict[str, str]:
-        with self._connect() as client:
-            served: dict[str, dict[str, str]] = {one["name"]: one["aliases"] for one in client.listing()["policies"]}
-        return served.get(self._target.policy, {})
+        policies = self._ask(lambda client: client.listing()["policies"])
+        return next((dict(one["aliases"]) for one in policies if one["name"] == self._target.policy), {})
 
     def _move(self, version: str, before: str | None) -> None:
         name, alias = self._target.policy, self._target.alias
@@ -157,13 +147,12 @@ class Release:
                 f"alias '{alias}' of policy '{name}' points to version {there}, but this run had moved it to {before}: "
                 "is another learner moving it? Give each run its own --alias"
             )
-        with self._connect() as client:
-            client.alias(name, alias, version, expected=there)
+        self._ask(lambda client: client.alias(name, alias, version, expected=there))
 
     def _promote(self, version: str, terms: Terms) -> str | None:
         """Put a version into production as `rlservo policy promote` does, resuming from its log."""
         log = self._run.path / "promotions" / f"{version}.jsonl"
-        if self._until_reached(lambda: self._aliases().get(PRODUCTION)) == version:
+        if self._aliases().get(PRODUCTION) == version:
             return None
         terms = replace(terms, version=version)
         log.parent.mkdir(exist_ok=True)
@@ -179,6 +168,15 @@ class Release:
         if outcome.outcome not in (PROMOTED, ROLLED_BACK):
             raise ConflictError(f"version {version} was not promoted: {outcome.why}")
         return outcome.why if outcome.outcome == ROLLED_BACK else None
+
+    def _ask(self, question: Callable[[AdminClient], Result]) -> Result:
+        """Return the server's answer, however long that takes."""
+
+        def ask() -> Result:
+            with self._connect() as client:
+                return question(client)
+
+        return self._until_reached(ask)
 
     def _until_reached(self, change: Callable[[], Result]) -> Result:
         """Return the result of `change`, which is retried until the server or the storage is reachable."""
