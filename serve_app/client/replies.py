@@ -100,25 +100,20 @@ def answering_version(url: str, reply: Any, number: int, contract: Contract) -> 
 
 def check_successor(contract: Contract, known: Contract) -> None:
     """Refuse a version whose observations or actions differ from those of the known one."""
+    differing: list[str] = []
     for word, key in (("observation", "obs"), ("action", "action")):
         theirs, ours = (leaf_specs(getattr(each, f"{word}_space"), key) for each in (contract, known))
-        if theirs != ours or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
-            differing = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
-            raise UnavailableError(
-                f"version {contract.version} of policy '{contract.name}' answers now, and its {word} space differs "
-                "from "
-                f"that of version {known.version}, which this client knows ({', '.join(differing) or word}): the "
-                "action was dropped; make a new client, or one with version=",
-                {"version": contract.version, "known": known.version, "differing": differing},
-            )
+        leaves = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
+        if leaves or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
+            differing += leaves or [f"{word} space"]
     has_reward, had_reward = (any(tensor.name == REWARD for tensor in each.inputs) for each in (contract, known))
-    if has_reward != had_reward:
-        takes = ("does not take", "takes")
+    differing += [REWARD] if has_reward != had_reward else []
+    if differing:
         raise UnavailableError(
-            f"version {contract.version} of policy '{contract.name}' answers now and {takes[has_reward]} the reward; "
-            f"version {known.version}, which this client knows, {takes[had_reward]} it: the action was dropped; create "
-            "a new client, or one with version=",
-            {"version": contract.version, "known": known.version, "differing": [REWARD]},
+            f"version {contract.version} of policy '{contract.name}' answers now, and differs from version "
+            f"{known.version}, which this client knows, in {', '.join(differing)}: the action was dropped; make a new "
+            "client, or one with version=",
+            {"version": contract.version, "known": known.version, "differing": differing},
         )
 
 
