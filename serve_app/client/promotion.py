@@ -77,7 +77,7 @@ class Promotion:
         """`connect` makes a client for an address, with the key as it is then; `say` takes lines for the operator."""
         self._connect, self._terms, self._log = connect, terms, log
         self._every_s, self._say, self._sleep, self._clock = every_s, say, sleep, clock
-        self._ours = {CANARY: f"{terms.version}={terms.share:g}"}  # how the server should use versions meanwhile
+        self._ours = {IN_USE: "", CANARY: f"{terms.version}={terms.share:g}"}  # uses of versions meanwhile
         if terms.limits.action_difference is not None:
             self._ours[SHADOW] = terms.version
         self._generation = 0  # of the newest plan that was seen
@@ -126,7 +126,7 @@ class Promotion:
             try:
                 return step()
             except RlservoError as error:
-                if isinstance(error, UntrustedError) or self._clock() > deadline:
+                if isinstance(error, UntrustedError | ConflictError) or self._clock() > deadline:
                     raise
                 self._say(f"trying again: {error.message}")
             self._sleep(self._every_s)
@@ -137,7 +137,7 @@ class Promotion:
         """Check the server's plan, and count from here on. Raises RlservoError."""
         terms, served = self._terms, self._served()
         name, version = terms.policy, terms.version
-        if served is None:
+        if not served.versions:
             raise UsageError(f"no policy '{name}' is served: see 'rlservo policy list'")
         if version not in served.versions:
             raise UsageError(
@@ -146,9 +146,8 @@ class Promotion:
             )
         if served.uses[IN_USE] == version:
             raise UsageError(f"version {version} of policy '{name}' is in production already")
-        for use in self._ours:
-            if (running := served.uses[use]) != "none":
-                kind = use.removeprefix("the ")
+        for use, kind in ((CANARY, "canary"), (SHADOW, "shadow")):
+            if use in self._ours and (running := served.uses[use]) != "none":
                 raise UsageError(
                     f"policy '{name}' has a {kind} already, {running}: 'rlservo policy {kind} {name} off' ends it "
                     f"({served.last_change})"
@@ -208,8 +207,9 @@ class Promotion:
         while True:
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
             try:
-                if changed := self._patiently(self._look):
-                    return Outcome(STOPPED, changed)
+                self._patiently(self._look)
+            except ConflictError as error:
+                return Outcome(STOPPED, error.message)
             except UntrustedError as error:
                 return Outcome(ROLLED_BACK, error.message)
             except RlservoError as error:
@@ -217,10 +217,9 @@ class Promotion:
             if outcome := self._judge():
                 return outcome
 
-    def _look(self) -> str:
-        """Update the counts; return a sentence if another command has changed what is served."""
-        if changed := self._changed(self._served()):
-            return changed
+    def _look(self) -> None:
+        """Update the counts. Raises ConflictError if another command has changed what is served, UntrustedError."""
+        self._check(self._served())
         processes = self._processes()
         self._counts.add(processes)
         for name, process in processes.items():
@@ -228,7 +227,6 @@ class Promotion:
                 raise UnavailableError(f"replica '{name}' follows plan {process.plan:g}, not yet {self._generation}")
             if self._terms.version not in process.versions:
                 raise UnavailableError(f"replica '{name}' has not loaded version {self._terms.version}")
-        return ""
 
     def _judge(self) -> Outcome | None:
         """Log the counts; return the outcome if there is one."""
@@ -244,17 +242,16 @@ class Promotion:
         against = surely or [each for each in found if each.is_beyond or each.lacks]
         return Outcome(ROLLED_BACK, "; ".join(map(str, against))) if against else Outcome(PROMOTED, all_of_it)
 
-    def _changed(self, served: _Served | None) -> str:
-        """Return a sentence on what another command has changed."""
-        if served is None:
-            return f"policy '{self._terms.policy}' is no longer served"
+    def _check(self, served: _Served) -> None:
+        """Raise ConflictError if another command has changed what is served."""
+        if not served.versions:
+            raise ConflictError(f"policy '{self._terms.policy}' is no longer served")
         for use, ours in self._ours.items():
             if (now := served.uses[use]) != ours:  # a version that is unloaded has none
-                return (
+                raise ConflictError(
                     f"another command has changed what is served: {use} is {now} and no longer {ours} "
                     f"({served.last_change})"
                 )
-        return ""
 
     # Carry out what was decided.
 
@@ -265,29 +262,31 @@ class Promotion:
         """
         name, version, served = self._terms.policy, self._terms.version, self._served()
         outcome, why, _ = decided
-        if outcome == PROMOTED and (served is None or served.uses[IN_USE] != version):
-            changed = self._changed(served)
-            if not changed and self._decided_at not in (None, self._generation):
-                changed = f"someone may have undone this promotion ({served and served.last_change}): start it again"
+        if outcome == PROMOTED and served.uses[IN_USE] != version:
             try:
-                if not changed:
-                    self._change(lambda client: client.alias(name, PRODUCTION, version, expected=self._ours[IN_USE]))
+                self._check(served)
+                if self._decided_at not in (None, self._generation):
+                    raise ConflictError(
+                        f"someone may have undone this promotion ({served.last_change}): start it again"
+                    )
+                self._change(lambda client: client.alias(name, PRODUCTION, version, expected=self._ours[IN_USE]))
             except ConflictError as error:
-                changed = error.message
-            outcome, why = (STOPPED, changed) if changed else (outcome, why)
-        if served is not None and served.uses[CANARY] == self._ours[CANARY]:
+                outcome, why = STOPPED, error.message
+        if served.uses[CANARY] == self._ours[CANARY]:
             self._change(lambda client: client.canary(name, None))
         # The listing has no shadow that is in production itself.
-        if served is not None and SHADOW in self._ours and version in (served.uses[SHADOW], served.uses[IN_USE]):
+        if SHADOW in self._ours and version in (served.uses[SHADOW], served.uses[IN_USE]):
             self._change(lambda client: client.shadow(name, None))
-        if (served := self._served()) is not None:
-            why += f"; {served.uses[IN_USE]} is in production, the canary is {served.uses[CANARY]}"
-        return Outcome(outcome, why)
+        uses = self._served().uses
+        return Outcome(outcome, f"{why}; {uses[IN_USE]} is in production, the canary is {uses[CANARY]}")
 
     # Ask the servers.
 
-    def _served(self) -> _Served | None:
-        """Return the plan of the policy; None if it is not served. Raises RlservoError, also for an older plan."""
+    def _served(self) -> _Served:
+        """Return the plan of the policy, without versions if it is not served.
+
+        Raises RlservoError, also for an older plan.
+        """
         with self._connect(self._terms.urls[0]) as client:
             listing = client.listing()
         try:
@@ -295,15 +294,17 @@ class Promotion:
             if generation < self._generation:  # of a worker or replica that has not followed yet
                 raise UnavailableError(f"the server follows plan {generation}, not yet {self._generation}")
             self._generation = generation
-            policy = next((policy for policy in listing["policies"] if policy["name"] == self._terms.policy), None)
-            if policy is None:
-                return None
-            canary, shadow, aliases = policy["canary"], policy["shadow"], policy["aliases"]
-            uses = {IN_USE: policy["version"], CANARY: "none", SHADOW: shadow["version"] if shadow else "none"}
-            if canary:
-                uses[CANARY] = f"{aliases.get(canary['version'], canary['version'])}={canary['share']:g}"
+            uses, versions = dict.fromkeys((IN_USE, CANARY, SHADOW), "none"), []
+            for policy in listing["policies"]:
+                if policy["name"] == self._terms.policy:
+                    canary, shadow, aliases = policy["canary"], policy["shadow"], policy["aliases"]
+                    versions, uses[IN_USE] = policy["versions"], policy["version"]
+                    if canary:
+                        uses[CANARY] = f"{aliases.get(canary['version'], canary['version'])}={canary['share']:g}"
+                    if shadow:
+                        uses[SHADOW] = shadow["version"]
             last_change = f"the last change was '{listing['changed_by']}', at {listing['changed_at'][:19]} UTC"
-            return _Served(last_change, policy["versions"], uses)
+            return _Served(last_change, versions, uses)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UnavailableError(f"the server's listing cannot be read ({error!r})") from None
 

@@ -84,6 +84,8 @@ class VersionLoader:
         continues then, and the next call may find it done.
         """
         key = (name, version, digest)
+        if (policy := self.get(*key)) is not None:
+            return policy
         task = self._tasks.get(key)
         if task is None:  # other callers meanwhile wait for the same task
             what = f"loading policy '{name}' version {version}"
