@@ -8,7 +8,6 @@ file system returns, or with the process. Their number is limited.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import threading
 import time
@@ -31,31 +30,37 @@ class BlockingCalls:
     """Runs functions in threads that can be given up."""
 
     def __init__(self, limit: int = LIMIT) -> None:
-        self._limit = limit
-        self._free = asyncio.Semaphore(limit)
+        self._free = threading.Semaphore(limit)
 
     async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None, what: str) -> Result:
-        """Return what the function returns; raise what it raises, and UnavailableError when it takes too long.
+        """Return what the function returns, as `wait` does."""
+        return await self.wait(self.start(function, *arguments, timeout_s=timeout_s), timeout_s=timeout_s, what=what)
+
+    def start(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None = None) -> Future[Result]:
+        """Call a function when a thread is free, which may take `timeout_s`; then it goes on whoever waits for it."""
+        outcome: Future[Result] = Future()
+        outcome.set_running_or_notify_cancel()  # it cannot be cancelled
+
+        def call() -> None:
+            if not self._free.acquire(timeout=timeout_s):
+                return  # those who wait have given up
+            try:
+                settle: Callable[[], None] = partial(outcome.set_result, function(*arguments))
+            except BaseException as error:
+                settle = partial(outcome.set_exception, error)
+            self._free.release()
+            settle()
+
+        # A daemon thread, so that the process can end while it is stuck.
+        threading.Thread(target=call, name="policies", daemon=True).start()
+        return outcome
+
+    async def wait(self, outcome: Future[Result], *, timeout_s: float | None, what: str) -> Result:
+        """Return a call's result; raise what it raises, and UnavailableError when it takes too long.
 
         `what` names the activity in the error. A `timeout_s` of None waits for as long as it takes.
         """
         began = time.monotonic()
-        try:
-            await asyncio.wait_for(self._free.acquire(), timeout_s)
-        except asyncio.TimeoutError:  # which is Python's own from 3.11 on
-            raise UnavailableError(
-                f"{what} could not start within {timeout_s:g} s: {self._limit} earlier calls have not come back "
-                "from the file system"
-            ) from None
-        loop = asyncio.get_running_loop()
-        outcome: Future[Result] = Future()
-        outcome.set_running_or_notify_cancel()  # the call goes on if its caller gives up
-        outcome.add_done_callback(partial(self._release, loop))
-        try:  # a daemon thread, so that the process can end while it is stuck
-            threading.Thread(target=_call, args=(outcome, function, *arguments), name="policies", daemon=True).start()
-        except RuntimeError:  # there are too many in this process
-            self._free.release()
-            raise
         returned = asyncio.wrap_future(outcome)
         try:
             while timeout_s is None or time.monotonic() - began < timeout_s:
@@ -68,14 +73,3 @@ class BlockingCalls:
         finally:
             returned.cancel()  # if it has not returned, its result is no longer wanted
         raise UnavailableError(f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?")
-
-    def _release(self, loop: asyncio.AbstractEventLoop, _outcome: Future[Any]) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(self._free.release)
-
-
-def _call(outcome: Future[Result], function: Callable[..., Result], *arguments: Any) -> None:
-    try:
-        outcome.set_result(function(*arguments))
-    except BaseException as error:
-        outcome.set_exception(error)

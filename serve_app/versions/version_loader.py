@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from rlservo.export.contract.contract import Contract
@@ -50,23 +50,22 @@ class VersionLoader:
         self._options = options or {}
         self._timeout_s = timeout_s
         self._calls = BlockingCalls()
-        self._tasks: dict[Loadable, asyncio.Task[Policy]] = {}
-        """Loaded versions, and those that are being loaded."""
+        self._loads: dict[Loadable, Future[Policy]] = {}
+        """Loaded versions, and those that are being loaded or could not be."""
 
     @property
     def loading(self) -> set[Key]:
         """Name and version of what is being loaded."""
-        return {(name, version) for (name, version, _), task in self._tasks.items() if not task.done()}
+        return {(name, version) for (name, version, _), load in self._loads.items() if not load.done()}
 
     def get(self, name: str, version: str, digest: str) -> Policy | None:
         """Return the policy if the bundle with that hash is in memory."""
-        task = self._tasks.get((name, version, digest))
-        is_loaded = task is not None and task.done() and not task.cancelled() and task.exception() is None
-        return task.result() if task is not None and is_loaded else None
+        load = self._loads.get((name, version, digest))
+        return None if load is None or not load.done() or load.exception() else load.result()
 
     def keep(self, served: Collection[Loadable]) -> None:
         """Forget the versions in memory that are not served, such as those that were proven for a refused command."""
-        self._tasks = {key: task for key, task in self._tasks.items() if key in served or not task.done()}
+        self._loads = {key: load for key, load in self._loads.items() if key in served or not load.done()}
 
     async def look(self) -> Listing:
         """Return what the repository holds now. Raises UnavailableError when that takes too long."""
@@ -84,22 +83,11 @@ class VersionLoader:
         continues then, and the next call may find it done.
         """
         key = (name, version, digest)
-        if (policy := self.get(*key)) is not None:
-            return policy
-        task = self._tasks.get(key)
-        if task is None:  # other callers meanwhile wait for the same task
-            what = f"loading policy '{name}' version {version}"
-            task = asyncio.create_task(self._calls.run(self._load_accepted, *key, timeout_s=None, what=what))
-            self._tasks[key] = task
-        done, _ = await asyncio.wait([task], timeout=self._timeout_s)
-        if not done:
-            raise UnavailableError(
-                f"loading policy '{name}' version {version} took longer than {self._timeout_s:g} s and was given "
-                "up: does the file system hang?"
-            )
-        if self.get(*key) is None:
-            self._tasks.pop(key, None)  # the next call tries again
-        return task.result()
+        load = self._loads.get(key)  # other callers meanwhile wait for the same one
+        if load is None or (load.done() and load.exception()):
+            load = self._loads[key] = self._calls.start(self._load_accepted, *key)
+        what = f"loading policy '{name}' version {version}"
+        return await self._calls.wait(load, timeout_s=self._timeout_s, what=what)
 
     async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
         """Load new versions of `policies` and those with an alias; check that canary and shadow fit the default one.
