@@ -88,7 +88,6 @@ class PlanFollower:
             refused = error.details.get("versions", ())
             self._refused = {(each["name"], each["version"]): each["reason"] for each in refused}
             raise
-        self._try_again()
         await self._apply(plan)
         return plan
 
@@ -100,15 +99,11 @@ class PlanFollower:
     async def follow(self) -> None:
         """Serve the newest plan if another one is served, and try again what could not be loaded a while ago."""
         plan = await self._files.call(self._files.after, self._generation())
-        if self._failed and time.monotonic() - self._tried_at > RETRY_PERIOD_S and self._try_again():
+        can_try_again = any(key[:2] not in self._loader.loading for key in self._failed)
+        if can_try_again and time.monotonic() - self._tried_at > RETRY_PERIOD_S:
             plan = plan or self.plan
         if plan is not None:
             await self._apply(plan)
-
-    def _try_again(self) -> bool:
-        """Forget what could not be loaded, except versions that are still loading: a file system may hang."""
-        before, self._failed = self._failed, {k: e for k, e in self._failed.items() if k[:2] in self._loader.loading}
-        return self._failed != before
 
     async def poll_plan(self) -> None:
         """Follow the plans that others write, until cancelled."""
@@ -186,13 +181,14 @@ class PlanFollower:
 
         Raises BundleError if this process serves nothing yet and a default version cannot be loaded.
         """
-        self._tried_at = time.monotonic()
+        self._tried_at, loading = time.monotonic(), self._loader.loading
         found: dict[Loadable, Policy | RlservoError] = {}
         for name, wanted in plan.policies.items():
             for version, digest in wanted.versions.items():
                 key = (name, version, digest)
-                try:
-                    found[key] = self._failed.get(key) or await self._loader.load(*key)
+                try:  # a version that is still loading is not waited for again: a file system may hang
+                    hanging = self._failed.get(key) if key[:2] in loading else None
+                    found[key] = hanging or await self._loader.load(*key)
                 except RlservoError as error:
                     found[key] = error
         self._arrange(plan, found)
