@@ -171,6 +171,22 @@ def test_stateless_loop_follows_production_at_once(arms: Server, kind: Kind) -> 
 
 
 @CLIENTS
+def test_an_alias_is_looked_up_at_each_reset(arms: Server, kind: Kind) -> None:
+    with kind(arms.url, "ur5", version=PRODUCTION, deadline_ms=20_000) as client:
+        for before, production in ("11", "12", "21"):
+            arms.move(production)
+            assert np.array_equal(client.act(OBS), arms.action(before))  # the episode stays with its version
+            client.reset()
+            assert np.array_equal(client.act(OBS), arms.action(production))
+
+
+def test_a_stream_without_a_name_gets_the_servers_default_policy(arms: Server) -> None:
+    with StreamClient(arms.url) as client:
+        assert client.contract.name == "ur5" and np.array_equal(client.act(OBS), arms.action("1"))
+        assert client.reconnects == 0
+
+
+@CLIENTS
 @pytest.mark.parametrize("server_state", [False, True])
 def test_episode_with_a_state_ends_with_the_version_that_began_it(
     recurrents: Server, kind: Kind, server_state: bool
