@@ -75,7 +75,7 @@ class StreamClient(RemotePolicy):
         self._timeout_s = timeout_s
         transport.label = secrets.token_hex(8)  # during a canary, all its connections get the same version
         self._socket: WebSocket | None = None
-        self._path = ""  # that of the last connection
+        self._address: tuple[str, str | None] = ("", None)  # policy and version of the last connection
         self._connections = 0
         self.stale = 0
         """Answers that came after their deadline and were dropped."""
@@ -141,19 +141,18 @@ class StreamClient(RemotePolicy):
 
     def _connected(self, contract: Contract, deadline: float) -> WebSocket:
         """Return the connection to a policy, or to the version that was named."""
-        version = "" if self._version is None else f"/versions/{quote(contract.version, safe='')}"
-        path = f"/v1/policies/{quote(contract.name, safe='')}{version}/stream"
-        if path != self._path:
+        address = (contract.name, None if self._version is None else contract.version)
+        if address != self._address:
             self._disconnect()
         while self._socket is None:
             try:
-                self._socket, _ = self._open(path, deadline)
+                self._socket, _ = self._open(_path(*address), deadline)
             except BrokenError:
                 if time.monotonic() + WAIT_S >= deadline:
                     raise
                 time.sleep(WAIT_S)
                 continue
-            self._path = path
+            self._address = address
             self._connections += 1
             self._episode.reconnect()
         return self._socket
@@ -188,3 +187,8 @@ class StreamClient(RemotePolicy):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+def _path(name: str, version: str | None) -> str:
+    which = "" if version is None else f"/versions/{quote(version, safe='')}"
+    return f"/v1/policies/{quote(name, safe='')}{which}/stream"
