@@ -7,6 +7,8 @@ import uuid
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import SessionLostError
 from rlservo.serve_app.client.replies import check_step, is_action, next_state
@@ -108,4 +110,6 @@ class ClientEpisode:
             if self.is_carried(contract):
                 self._state = next_state(reply, contract)
             self._steps += 1
-        self._last_action, self._is_last_action_known = copy.deepcopy(action), True  # the loop may write into its own
+        # The loop may write into its own.
+        self._last_action = action.copy() if isinstance(action, np.ndarray) else copy.deepcopy(action)
+        self._is_last_action_known = True
