@@ -294,7 +294,8 @@ class Promotion:
             if generation < self._generation:  # of a worker or replica that has not followed yet
                 raise UnavailableError(f"the server follows plan {generation}, not yet {self._generation}")
             self._generation = generation
-            uses, versions = dict.fromkeys((IN_USE, CANARY, SHADOW), "none"), []
+            uses: dict[str, str] = {IN_USE: "none", CANARY: "none", SHADOW: "none"}
+            versions: list[str] = []
             for policy in listing["policies"]:
                 if policy["name"] == self._terms.policy:
                     canary, shadow, aliases = policy["canary"], policy["shadow"], policy["aliases"]
