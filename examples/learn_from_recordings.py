@@ -35,7 +35,7 @@ from ray.rllib.core.rl_module.rl_module import RLModule, RLModuleSpec
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from shared.help_text import DefaultsFormatter
-from shared.recorded_episodes import RecordedEpisodes
+from shared.recorded_episodes import Choice, Recorded, RecordedEpisodes, read_recordings
 
 from rlservo import errors
 from rlservo.deploy.terminal import status
@@ -47,7 +47,7 @@ from rlservo.export.checkpoints.location import (
     locate_checkpoint,
 )
 from rlservo.export.rllib import private_names
-from rlservo.serve_app.learning.rllib_episodes import Choice, Recorded, read_recordings, through_connectors
+from rlservo.serve_app.learning.rllib_episodes import through_connectors
 from rlservo.serve_app.recording.conversion import gym_space
 from rlservo.serve_app.recording.reader import Recording
 

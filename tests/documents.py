@@ -38,7 +38,7 @@ STAYS = re.compile(  # until Ctrl-C
 )
 BEGUN = {
     "serve": "Ctrl-C|Submitted deploy config",
-    "learn": "is the checkpoint itself",
+    "learn": "loaded after 0 updates",
     "policy promote": "watching version",
     "ros2": " -> stopped",
 }

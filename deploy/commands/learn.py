@@ -79,6 +79,7 @@ def learn(
     require("train", "torch", "onnx")
     with needs_extra("client"):
         from rlservo.serve_app.client.admin_client import AdminClient, find_key
+        from rlservo.serve_app.client.promotion import Terms
         from rlservo.serve_app.client.promotion_evidence import Limits
     with needs_extra("record"):
         from rlservo.serve_app.learning.following import FollowedRecordings, ServerRecordings
@@ -105,7 +106,7 @@ def learn(
         from rlservo.export.checkpoints.unpickle import user_code
         from rlservo.serve_app.learning.admission import Admission, reward_of
         from rlservo.serve_app.learning.online import OnlineLearning, why_interrupted
-        from rlservo.serve_app.learning.release import Canary, Release, Target
+        from rlservo.serve_app.learning.release import Release, Target
         from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 
         if promote is None:
@@ -117,7 +118,7 @@ def learn(
             seconds = parse_number("--promote", promote, SECONDS, LONGEST_S)
             if not share or not seconds:
                 raise UsageError("--promote and --canary: expected more than 0")
-            watched = Canary(share, seconds, Limits(error_rate=rate, success_drop=drop))
+            watched = Terms((server,), policy, "", share, seconds, Limits(error_rate=rate, success_drop=drop))
         copies = [
             ServerRecordings(partial(connect, url), run.path / "followed" / re.sub(r"[^A-Za-z0-9.]+", "_", url))
             for url in follow
@@ -128,7 +129,7 @@ def learn(
             with user_code(app_dir):
                 learner = OnlineLearner(checkpoint, batch_size=batch_size)
                 target = Target(policy, repository, alias, watched)
-                release = Release(target, run, partial(connect, server), url=server, app_dir=app_dir, progress=show)
+                release = Release(target, run, partial(connect, server), app_dir=app_dir, progress=show)
                 function = release.named_reward() if source is None else reward_of(source, str(reward))
                 age = learner.max_age if max_age is None else max_age
                 admission = Admission(policy, max_age=age, reward=function)

@@ -1,4 +1,4 @@
-"""Whole recorded episodes in memory, as what RLlib's offline learners draw their minibatches from.
+"""Whole recorded episodes in memory: chosen, and drawn from as RLlib's offline learners do.
 
 RLlib's `OfflineData` (ray 2.60) cuts what it reads into single steps, so that MARWIL's advantages are errors of one
 step under a value function that is hardly ever renewed, starts every sequence of a recurrent module from zeros, and
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import shared.ray_settings as ray_settings  # before Ray  # isort: skip
@@ -21,8 +21,93 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.offline.offline_data import OfflineData
 from ray.rllib.utils import flatten_dict
 
+from rlservo import errors
+from rlservo.serve_app.learning.rllib_episodes import single_agent_episode, why_not_whole, why_without_reward
+from rlservo.serve_app.recording.conversion import episodes_of_one
+from rlservo.serve_app.recording.episodes import Episode
+from rlservo.serve_app.recording.own_actions import OwnActions, modes, own_actions
+from rlservo.serve_app.recording.reader import Recording
+
 assert ray_settings
 AT_ONCE = 256  # episodes from which minibatches are drawn
+
+
+@dataclass
+class Recorded:
+    """Episodes for a learner: observations as the environment gave them, the module's own actions."""
+
+    contract: Any
+    episodes: list[SingleAgentEpisode] = field(default_factory=list)
+    """In the form that `env.step` gives; not yet passed through connectors."""
+    not_used: dict[str, int] = field(default_factory=dict)
+    """Unusable episodes, by reason."""
+    own: int = 0
+    """Decisions whose own action was recorded."""
+    inverted: int = 0
+    """Decisions whose own action is the inverse of the executed one."""
+    clipped: int = 0
+    """Number of those at or beyond a bound."""
+
+    @property
+    def decisions(self) -> int:
+        return self.own + self.inverted
+
+    @property
+    def mean_return(self) -> float:
+        return float(np.mean([episode.get_return() for episode in self.episodes]))
+
+    def add(self, episode: Episode, own: OwnActions, ahead: int) -> None:
+        """Add an episode."""
+        self.own += int(own.recorded.sum())
+        self.inverted += int((~own.recorded).sum())
+        self.clipped += int(own.clipped.sum())
+        id_ = f"{len(self.episodes)}"  # RLlib numbers episodes with "_" behind their ids
+        self.episodes.append(single_agent_episode(episode, own.leaves, episode.reward, id_=id_, ahead=ahead))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Selection of episodes, and of the actions to learn from them."""
+
+    rewards: bool
+    """Whether the learner needs rewards, and the observation after the end of a truncated episode."""
+    status: str | None
+    """Only episodes with this final status."""
+    modes: bool
+    """Whether to learn the most likely action of a recorded distribution instead of the drawn one."""
+    ahead: int
+    """Number of cycles by which the action learned for an observation comes later."""
+
+
+def read_recordings(recording: Recording, choice: Choice, *, name: str | None) -> Recorded:
+    """Return the whole episodes of one policy that are usable for learning.
+
+    Raises UsageError if none can be used, and RecordingError.
+    """
+    recorded: Recorded | None = None
+    for episode in episodes_of_one(recording, name):
+        recorded = recorded or Recorded(episode.policy.contract)
+        own = modes(episode) if choice.modes else own_actions(episode)
+        reason = _why_not(episode, own, choice)
+        if reason is None:
+            recorded.add(episode, own, choice.ahead)
+        else:
+            recorded.not_used[reason] = recorded.not_used.get(reason, 0) + 1
+    assert recorded is not None, "episodes_of_one raises if there are none"
+    if not recorded.episodes:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in recorded.not_used.items())
+        raise errors.UsageError(f"no recorded episode can be learned from: {reasons}")
+    return recorded
+
+
+def _why_not(episode: Episode, own: OwnActions, choice: Choice) -> str | None:
+    if (reason := why_not_whole(episode)) is not None:
+        return reason
+    if choice.status is not None and episode.final_status != choice.status:
+        return f"that did not end in {choice.status!r}"
+    if not own.known.all():
+        return "without all of the module's own actions"
+    return why_without_reward(episode, episode.reward) if choice.rewards else None
 
 
 class RecordedEpisodes(OfflineData):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import uuid
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import SessionLostError
@@ -31,7 +34,7 @@ class ClientEpisode:
         """Start an episode."""
         self._state: dict[str, Any] = {}  # empty at an episode's start
         self._steps = 0
-        self._last_action: Any = None  # in the server's form
+        self._last_action: Any = None
         self._is_last_action_known = True  # whether the server has the same action
         self._is_lost = False
 
@@ -42,10 +45,6 @@ class ClientEpisode:
     def is_carried(self, contract: Contract) -> bool:
         """Return whether requests carry a `state`."""
         return not self.is_on_server(contract) and (bool(contract.state) or self._is_limited)
-
-    def is_bound(self, contract: Contract) -> bool:
-        """Return whether the episode's memory is of this policy's version."""
-        return bool(contract.state) and self._steps > 0
 
     def carry(self) -> None:
         """Send a `state` from now on, since the server has refused a request without one."""
@@ -60,8 +59,13 @@ class ClientEpisode:
         self._is_last_action_known = False
         self._is_lost = self._steps > 0
 
-    def request_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any]:
-        """Return the next request's fields on the episode.
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was an action since `reset`."""
+        return self._steps > 0
+
+    def request_fields(self, contract: Contract, batch: tuple[int, ...], *, ends: bool = False) -> dict[str, Any]:
+        """Return the next request's fields on the episode; `ends` if it reports the end.
 
         Before its reply, the server may have decided an action that never reached the robot.
 
@@ -77,6 +81,7 @@ class ClientEpisode:
                     self._session_id = uuid.uuid4().hex
                 self._has_unanswered_start = self._steps == 0
                 fields["session_id"] = self._session_id
+                fields |= {"end": True} if ends else {}
         elif self.is_carried(contract):
             fields["state"] = self._state
         elif self._is_stream and self._steps == 0:
@@ -87,18 +92,6 @@ class ClientEpisode:
         self._is_last_action_known = False
         return fields
 
-    def end_fields(self, contract: Contract, batch: tuple[int, ...]) -> dict[str, Any] | None:
-        """Return the fields of a request that reports the episode's end; None if there is nothing to end.
-
-        Raises SessionLostError.
-        """
-        if self._steps == 0:
-            return None
-        fields = self.request_fields(contract, batch)
-        if self._session_id is not None:
-            fields["end"] = True
-        return fields
-
     def end(self) -> None:
         """Note that the server knows the episode's end: the next episode gets its own session."""
         self.reset()
@@ -106,7 +99,7 @@ class ClientEpisode:
             self._session_id = uuid.uuid4().hex
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
-        """Advance to the next step after a reply; `action` is the reply's, in the form for sending.
+        """Advance to the next step after a reply; `action` is the reply's.
 
         Raises SessionLostError when the reply belongs to another episode, UnavailableError when it lacks the state.
         """
@@ -117,4 +110,6 @@ class ClientEpisode:
             if self.is_carried(contract):
                 self._state = next_state(reply, contract)
             self._steps += 1
-        self._last_action, self._is_last_action_known = action, True
+        # The loop may write into its own.
+        self._last_action = action.copy() if isinstance(action, np.ndarray) else copy.deepcopy(action)
+        self._is_last_action_known = True

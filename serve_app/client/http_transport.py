@@ -6,6 +6,7 @@ that is incomplete by then is never returned.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
@@ -35,6 +36,7 @@ except ModuleNotFoundError:
 
 FIRST_WAIT_S = 0.05  # before the second attempt; doubled each time
 LONGEST_WAIT_S = 2.0
+FIRST_BYTES = 65536
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; a wrong URL must not fill the memory
 LABEL = LABEL_HEADER.encode()
 KEEPALIVE_S = 5.0  # that an idle connection is kept
@@ -53,12 +55,21 @@ class DroppedError(UnavailableError):
 class Transport:
     """A keep-alive connection to one server, or a pool of them if several threads call. Thread-safe."""
 
-    def __init__(self, url: str, *, timeout_s: float, retries: int, api_key: str | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        timeout_s: float,
+        retries: int,
+        api_key: str | None = None,
+        schemes: Mapping[str, str] = SCHEMES,
+    ) -> None:
         """Check the arguments; nothing is sent before the first call.
 
-        `api_key` travels as `Authorization: Api-Key <key>`, as openpi's clients send it.
+        `api_key` travels as `Authorization: Api-Key <key>`, as openpi's clients send it. `schemes` has the connection's
+        scheme for each one that an address may have.
         """
-        self.url = parse_address(url, SCHEMES)
+        self.url = parse_address(url, schemes)
         if not timeout_s > 0:
             raise UsageError(f"timeout_s must be above 0 seconds, got {timeout_s}")
         if retries < 0:
@@ -106,6 +117,11 @@ class Transport:
         """Send a JSON document and return the JSON answer."""
         return self._parse(*self._call("POST", path, body, timeout_s, None))
 
+    def check_open(self) -> None:
+        """Raise UsageError after `close`."""
+        if self._is_closed:
+            raise UsageError("the client is closed: create a new one")
+
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
         self._is_closed = True
@@ -120,8 +136,7 @@ class Transport:
         UnavailableError if the server cannot be reached or keeps answering 503, or a gateway 500 or 502, and otherwise
         the error that the server names.
         """
-        if self._is_closed:
-            raise UsageError("the client is closed: create a new one")
+        self.check_open()
         url = "/".join((self.url, *(quote(part, safe="") for part in path)))
         scheme, host, port, prefix = self._address
         target = "/".join((prefix, *(quote(part, safe="") for part in path))) or "/"
@@ -153,36 +168,67 @@ class Transport:
             time.sleep(wait)
         raise AssertionError("the last wait is None")
 
+    def upgrade(self, path: str, headers: Headers, deadline: float) -> tuple[httpcore.Response, bytes]:
+        """Ask for another protocol at `path`; return the response, to be closed, and the first bytes behind its head.
+
+        With status 101 these are the protocol's own, and its `network_stream` has the connection; otherwise they are
+        the whole body. Raises UnavailableError and DeadlineError.
+        """
+        scheme, host, port, prefix = self._address
+        url = httpcore.URL(scheme=scheme, host=host, port=port, target=prefix + path)
+        request = httpcore.Request("GET", url, headers=self._labelled(*headers))
+        with self._attempt(deadline, round(deadline - time.monotonic(), 2)) as timeout:
+            request.extensions = {"timeout": timeout}
+            response = self._pool.handle_request(request)
+            if response.status != 101:
+                return response, self._read(response, deadline)
+            try:
+                return response, response.extensions["network_stream"].read(FIRST_BYTES)
+            except BaseException:
+                response.close()
+                raise
+
     def _exchange(self, method: str, url: httpcore.URL, body: bytes | None, deadline: float, budget: float) -> Reply:
         """Return the reply to one attempt."""
-        remaining = deadline - time.monotonic()
-        timeout_error = DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget})
-        if remaining <= 0:
-            raise timeout_error
-        headers = self._headers
-        if self.label is not None:
-            headers = [*headers, (LABEL, self.label.encode())]
+        headers = self._labelled()
         if body is not None:
             headers = [*headers, (b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
-        timeout = dict.fromkeys(("connect", "read", "write", "pool"), remaining)
-        request = httpcore.Request(method, url, headers=headers, content=body, extensions={"timeout": timeout})
+        with self._attempt(deadline, budget) as timeout:
+            request = httpcore.Request(method, url, headers=headers, content=body, extensions={"timeout": timeout})
+            response = self._pool.handle_request(request)
+            return response.status, response.headers, self._read(response, deadline)
+
+    def _labelled(self, *more: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
+        return [*self._headers, *more, *([] if self.label is None else [(LABEL, self.label.encode())])]
+
+    def _read(self, response: httpcore.Response, deadline: float) -> bytes:
+        content = b""
+        try:
+            for chunk in response.iter_stream():
+                content += chunk
+                if time.monotonic() > deadline:
+                    raise httpcore.ReadTimeout
+                if len(content) > MAX_REPLY_BYTES:
+                    raise TooLargeError(
+                        f"{self.url} sent more than {MAX_REPLY_BYTES >> 20} MiB: is it an rlservo server?"
+                    )
+        finally:
+            response.close()  # an unread rest closes the connection, so a late answer cannot reach the next request
+        if time.monotonic() > deadline:
+            raise httpcore.ReadTimeout
+        return content
+
+    @contextlib.contextmanager
+    def _attempt(self, deadline: float, budget: float) -> Iterator[dict[str, float]]:
+        """Give httpcore's time-outs of one attempt; raise its failures as errors of ours."""
+        remaining = deadline - time.monotonic()
         self._backend.deadline = deadline
         try:
-            response = self._pool.handle_request(request)
-            try:
-                content = b""
-                for chunk in response.iter_stream():
-                    content += chunk
-                    if time.monotonic() > deadline:
-                        raise timeout_error
-                    if len(content) > MAX_REPLY_BYTES:
-                        raise TooLargeError(
-                            f"{self.url} sent more than {MAX_REPLY_BYTES >> 20} MiB: is it an rlservo server?"
-                        )
-            finally:
-                response.close()  # an unread rest closes the connection, so a late answer cannot reach the next request
+            if remaining <= 0:
+                raise httpcore.ReadTimeout
+            yield dict.fromkeys(("connect", "read", "write", "pool"), remaining)
         except (httpcore.ReadTimeout, httpcore.WriteTimeout) as error:
-            raise timeout_error from error
+            raise DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget}) from error
         except httpcore.ConnectTimeout as error:
             raise UnavailableError(f"{self.url} cannot be reached within {budget:g} s", {"url": self.url}) from error
         except FAILURES as error:
@@ -192,9 +238,6 @@ class Transport:
             raise UnavailableError(f"{self.url} cannot be reached: {why}", {"url": self.url}) from error
         finally:
             self._backend.deadline = None
-        if time.monotonic() > deadline:
-            raise timeout_error
-        return response.status, response.headers, content
 
     def _parse(self, content: bytes, url: str, status: int) -> Any:
         try:

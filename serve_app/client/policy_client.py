@@ -11,15 +11,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from numpy.typing import ArrayLike
-
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import StateNeededError, UnavailableError, UnknownPolicyError, UsageError
+from rlservo.export.contract.errors import StateNeededError, UsageError
 from rlservo.serve_app.client.client_episode import ClientEpisode
 from rlservo.serve_app.client.http_transport import Transport, encode
 from rlservo.serve_app.client.remote_policy import RemotePolicy
-from rlservo.serve_app.client.replies import answering_version, decode_action
-from rlservo.serve_app.interface import Observation
 
 if TYPE_CHECKING:
     from rlservo.serve_app.recording.recorder import Recorder
@@ -70,11 +65,8 @@ class PolicyClient(RemotePolicy):
         """
         if label is not None and not (label and label.isascii() and label.isprintable() and len(label) <= 100):
             raise UsageError(f"label must be 1 to 100 printable ASCII characters, got {label[:100]!r}")
-        self._transport = Transport(url, timeout_s=timeout_s, retries=retries, api_key=api_key)
-        self.url = self._transport.url
-        self._label = label
-        self._begin_label()
         super().__init__(
+            Transport(url, timeout_s=timeout_s, retries=retries, api_key=api_key),
             policy,
             version=version,
             timeout_s=timeout_s,
@@ -82,6 +74,8 @@ class PolicyClient(RemotePolicy):
             episode=ClientEpisode(server_state=server_state, is_stream=False),
             record=record,
         )
+        self._label = label
+        self._begin_label()
 
     @property
     def reconnects(self) -> int:
@@ -92,75 +86,27 @@ class PolicyClient(RemotePolicy):
         """Start an episode: the next request carries it. Sends nothing."""
         super().reset()
         self._begin_label()
-        # A version number needs no lookup.
-        known = self._contract
-        self._looks_up = self._version is not None and known is not None and self._version != known.version
 
     def _begin_label(self) -> None:
         number = secrets.token_hex(8 if self._label is None else 4)
         self._transport.label = number if self._label is None else f"{self._label}.{number}"
 
-    def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
-        contract = self.contract
-        deadline = time.monotonic() + self._deadline_ms / 1e3
-        request, batch = self._encode_request(obs, explore=explore, seed=seed, reward=reward)
-        request["seq"] = number = next(self._numbers)
-        try:
-            reply = self._post({**request, **self._episode.request_fields(contract, batch)}, self._deadline_ms)
-        except StateNeededError:
-            if self._episode.is_carried(contract) or self._episode.is_on_server(contract):
-                raise
-            # The contract does not say whether the server limits the step from one action to the next.
-            self._episode.carry()
-            request["seq"] = number = next(self._numbers)
-            fields = self._episode.request_fields(contract, batch)
-            reply = self._post({**request, **fields}, 1e3 * (deadline - time.monotonic()))
-        contract = self._answering_contract(reply, number, deadline)
-        action = decode_action(reply.get("action"), batch, contract)
-        self._episode.advance(reply, reply["action"], contract)
-        self.last_reply, self._reward = reply, None
-        return action
-
-    def _tell_end(self, request: dict[str, Any]) -> None:
-        number = next(self._numbers)
-        answering_version(self.url, self._post({**request, "seq": number}, self._deadline_ms), number, self.contract)
-
-    def _close(self) -> None:
-        self._transport.close()
-
-    def _post(self, request: dict[str, Any], deadline_ms: float) -> Any:
-        """Send a request for an action and return the reply."""
-        contract = self.contract
-        # The server drops requests that would be late, instead of working through a queue of abandoned ones.
-        body = encode({**request, "deadline_ms": deadline_ms})
-        version = () if self._version is None else ("versions", contract.version)
-        return self._transport.post(
-            "v1", "policies", contract.name, *version, "act", body=body, timeout_s=deadline_ms / 1e3
-        )
-
-    def _fetch_contract(self, timeout_s: float | None) -> Contract:
-        retries = None if timeout_s is None else 0
-        name = self._name
-        if name is None:
-            name = _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s, retries=retries))
-        version = () if self._version is None else ("versions", self._version)
-        document = self._transport.get("v1", "policies", name, *version, timeout_s=timeout_s, retries=retries)
-        return self._parse_contract(document)
-
-    def _fetch_version(self, version: str, deadline: float) -> Contract:
-        path = ("v1", "policies", self.contract.name, "versions", version)
-        timeout_s = max(deadline - time.monotonic(), 0.001)
-        return self._parse_contract(self._transport.get(*path, timeout_s=timeout_s, retries=0))
-
-
-def _only_policy(listing: Any) -> str:
-    """Return the name of the server's only policy, or raise an error that lists all of them."""
-    policies = listing.get("policies") if isinstance(listing, dict) else None
-    if not isinstance(policies, list):
-        raise UnavailableError("the server's list of policies cannot be read: does it run another version of rlservo?")
-    names = sorted({str(entry["name"]) for entry in policies if isinstance(entry, dict) and "name" in entry})
-    if not names:
-        raise UnknownPolicyError("the server has no policy loaded")
-    if len(names) > 1:
-        raise UsageError(f"the server has {len(names)} policies: name one of {', '.join(names)}", {"policies": names})
-    return names[0]
+    def _exchange(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float, *, ends: bool) -> Any:
+        left_ms, episode = self._deadline_ms, self._episode
+        while True:
+            contract = self.contract
+            version = () if self._version is None else ("versions", contract.version)
+            # With `deadline_ms` the server drops requests that would be late, instead of working through a queue.
+            fields = {**episode.request_fields(contract, batch, ends=ends), "deadline_ms": left_ms}
+            try:
+                return self._transport.post(
+                    *("v1", "policies", contract.name, *version, "act"),
+                    body=encode({**request, **fields}),
+                    timeout_s=left_ms / 1e3,
+                )
+            except StateNeededError:
+                if episode.is_carried(contract) or episode.is_on_server(contract):
+                    raise
+                # The contract does not say whether the server limits the step from one action to the next.
+                episode.carry()
+                left_ms = 1e3 * (deadline - time.monotonic())

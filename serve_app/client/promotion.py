@@ -23,6 +23,7 @@ from rlservo.serve_app.interface import PRODUCTION
 
 PATIENCE_S = 60.0  # with a server that is unreachable, or a process that does not follow
 MOST_CHECKS = 1000  # in a log, of one promotion
+IN_USE, CANARY, SHADOW = "production", "the canary", "the shadow"  # uses of versions
 
 PROMOTED, ROLLED_BACK, STOPPED, INTERRUPTED = "promoted", "rolled back", "stopped", "interrupted"
 EXIT_CODES = {PROMOTED: 0, ROLLED_BACK: 1, STOPPED: 4, INTERRUPTED: 130}  # 2 is for bad input
@@ -56,9 +57,7 @@ class _Served(NamedTuple):
 
     last_change: str
     versions: list[str]
-    production: str
-    canary: str  # such as "2=0.1"; "none" without one
-    shadow: str
+    uses: dict[str, str]  # of production, the canary (such as "2=0.1") and the shadow; "none" without one
 
 
 class Promotion:
@@ -78,9 +77,9 @@ class Promotion:
         """`connect` makes a client for an address, with the key as it is then; `say` takes lines for the operator."""
         self._connect, self._terms, self._log = connect, terms, log
         self._every_s, self._say, self._sleep, self._clock = every_s, say, sleep, clock
-        self._canary = f"{terms.version}={terms.share:g}"
-        self._shadow = "none" if terms.limits.action_difference is None else terms.version
-        self._production = ""  # the version that is in production
+        self._ours = {IN_USE: "", CANARY: f"{terms.version}={terms.share:g}"}  # uses of versions meanwhile
+        if terms.limits.action_difference is not None:
+            self._ours[SHADOW] = terms.version
         self._generation = 0  # of the newest plan that was seen
         self._decided_at: int | None = None  # that of an earlier run's decision
         self._counts = Counts()
@@ -90,13 +89,10 @@ class Promotion:
     def run(self) -> Outcome:
         """Watch and decide. Raises RlservoError if it cannot begin: bad input, or an unreachable server."""
         last, decided = self._log.last, None
-        try:
-            if last is None:
-                self._begin()
-            else:
-                decided = self._resume(last)
-        except UntrustedError as error:
-            raise UsageError(str(error)) from None
+        if last is None:
+            self._begin()
+        else:
+            decided = self._resume(last)
         try:
             if decided is None:
                 if last is None:
@@ -109,19 +105,19 @@ class Promotion:
             decided = Outcome(STOPPED, error.message)
         try:
             outcome = self._patiently(lambda: self._carry_out(decided))
-            try:
-                self._write(END, outcome)
-            except UsageError as error:
-                self._say(error.message)  # the same command, repeated, finds nothing left to do
-            return outcome
         except (RlservoError, KeyboardInterrupt) as error:
             why = error.message if isinstance(error, RlservoError) else "interrupted meanwhile"
-        return Outcome(
-            STOPPED,
-            f"{decided.why}; but this could not be carried out ({why}): the same command, given again, continues; "
-            f"'rlservo policy canary {self._terms.policy} off' ends a canary that is still running",
-            is_finished=False,
-        )
+            return Outcome(
+                STOPPED,
+                f"{decided.why}; but this could not be carried out ({why}): the same command, given again, continues; "
+                f"'rlservo policy canary {self._terms.policy} off' ends a canary that is still running",
+                is_finished=False,
+            )
+        try:
+            self._write(END, outcome)
+        except UsageError as error:
+            self._say(error.message)  # the same command, repeated, finds nothing left to do
+        return outcome
 
     def _patiently(self, step: Callable[[], Result]) -> Result:
         """Return what a step returns, trying for a minute."""
@@ -130,7 +126,7 @@ class Promotion:
             try:
                 return step()
             except RlservoError as error:
-                if self._clock() > deadline:
+                if isinstance(error, UntrustedError | ConflictError) or self._clock() > deadline:
                     raise
                 self._say(f"trying again: {error.message}")
             self._sleep(self._every_s)
@@ -138,38 +134,38 @@ class Promotion:
     # Begin, or continue.
 
     def _begin(self) -> None:
-        """Check the server's plan, and count from here on."""
+        """Check the server's plan, and count from here on. Raises RlservoError."""
         terms, served = self._terms, self._served()
         name, version = terms.policy, terms.version
-        if served is None:
+        if not served.versions:
             raise UsageError(f"no policy '{name}' is served: see 'rlservo policy list'")
         if version not in served.versions:
             raise UsageError(
                 f"policy '{name}' has no version {version}: expected one of {', '.join(served.versions)}; "
                 f"'rlservo policy load {name} {version}' loads it"
             )
-        if served.production == version:
+        if served.uses[IN_USE] == version:
             raise UsageError(f"version {version} of policy '{name}' is in production already")
-        for kind, running, own in (("canary", served.canary, self._canary), ("shadow", served.shadow, self._shadow)):
-            if running != "none" != own:
+        for use, kind in ((CANARY, "canary"), (SHADOW, "shadow")):
+            if use in self._ours and (running := served.uses[use]) != "none":
                 raise UsageError(
                     f"policy '{name}' has a {kind} already, {running}: 'rlservo policy {kind} {name} off' ends it "
                     f"({served.last_change})"
                 )
-        self._production = served.production
+        self._ours[IN_USE] = served.uses[IN_USE]
         self._counts.add(self._processes())
         self._write("start")
 
     def _start(self) -> None:
         """Start the shadow and the canary. Raises RlservoError."""
         terms = self._terms
-        if self._shadow != "none":
+        if SHADOW in self._ours:
             self._change(lambda client: client.shadow(terms.policy, terms.version))
         self._change(lambda client: client.canary(terms.policy, terms.version, terms.share))
         self._ends_at = self._clock() + terms.seconds
         self._say(
-            f"watching version {terms.version} of '{terms.policy}' against {self._production} for {terms.seconds:.0f} s"
-            f" on {', '.join(self._counts.seen)}; the log is {self._log.path}"
+            f"watching version {terms.version} of '{terms.policy}' against {self._ours[IN_USE]} for "
+            f"{terms.seconds:.0f} s on {', '.join(self._counts.seen)}; the log is {self._log.path}"
         )
 
     def _resume(self, last: dict[str, Any]) -> Outcome | None:
@@ -180,7 +176,7 @@ class Promotion:
                 "again, or name another --log"
             )
         try:
-            self._production, self._generation = last["production"], int(last["generation"])
+            self._ours[IN_USE], self._generation = last["production"], int(last["generation"])
             self._counts = Counts(**last["counts"])
             # A clock that was set back adds no time.
             gone_s = max(0.0, time.time() - datetime.fromisoformat(last["time"]).timestamp())
@@ -196,7 +192,7 @@ class Promotion:
         """Log everything that a promotion continues from. Raises UsageError."""
         state = {
             "terms": asdict(self._terms),
-            "production": self._production,
+            "production": self._ours[IN_USE],
             "generation": self._generation,
             "counts": asdict(self._counts),
             "remaining_s": self._remaining,
@@ -211,19 +207,19 @@ class Promotion:
         while True:
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
             try:
-                if changed := self._patiently(self._look):
-                    return Outcome(STOPPED, changed)
+                self._patiently(self._look)
+            except ConflictError as error:
+                return Outcome(STOPPED, error.message)
             except UntrustedError as error:
-                return Outcome(ROLLED_BACK, str(error))
+                return Outcome(ROLLED_BACK, error.message)
             except RlservoError as error:
                 return Outcome(ROLLED_BACK, f"it could not be judged for {PATIENCE_S:g} s: {error.message}")
             if outcome := self._judge():
                 return outcome
 
-    def _look(self) -> str:
-        """Update the counts; return a sentence if another command has changed what is served."""
-        if changed := self._changed(self._served()):
-            return changed
+    def _look(self) -> None:
+        """Update the counts. Raises ConflictError if another command has changed what is served, UntrustedError."""
+        self._check(self._served())
         processes = self._processes()
         self._counts.add(processes)
         for name, process in processes.items():
@@ -231,12 +227,11 @@ class Promotion:
                 raise UnavailableError(f"replica '{name}' follows plan {process.plan:g}, not yet {self._generation}")
             if self._terms.version not in process.versions:
                 raise UnavailableError(f"replica '{name}' has not loaded version {self._terms.version}")
-        return ""
 
     def _judge(self) -> Outcome | None:
         """Log the counts; return the outcome if there is one."""
         terms, remaining = self._terms, self._remaining
-        found = list(figures(terms.limits, self._counts.total, self._production, terms.version))
+        found = list(figures(terms.limits, self._counts.total, self._ours[IN_USE], terms.version))
         surely, all_of_it = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
         if surely or remaining <= 0 or self._clock() - self._logged_at >= terms.seconds / MOST_CHECKS:
             self._logged_at = self._clock()
@@ -247,21 +242,16 @@ class Promotion:
         against = surely or [each for each in found if each.is_beyond or each.lacks]
         return Outcome(ROLLED_BACK, "; ".join(map(str, against))) if against else Outcome(PROMOTED, all_of_it)
 
-    def _changed(self, served: _Served | None) -> str:
-        """Return a sentence on what another command has changed."""
-        if served is None:
-            return f"policy '{self._terms.policy}' is no longer served"
-        for what, now, ours in (
-            ("production", served.production, self._production),
-            ("the canary", served.canary, self._canary),  # a version that is unloaded has none
-            ("the shadow", served.shadow, self._shadow),
-        ):
-            if now != ours and not (what == "the shadow" and ours == "none"):
-                return (
-                    f"another command has changed what is served: {what} is {now} and no longer {ours} "
+    def _check(self, served: _Served) -> None:
+        """Raise ConflictError if another command has changed what is served."""
+        if not served.versions:
+            raise ConflictError(f"policy '{self._terms.policy}' is no longer served")
+        for use, ours in self._ours.items():
+            if (now := served.uses[use]) != ours:  # a version that is unloaded has none
+                raise ConflictError(
+                    f"another command has changed what is served: {use} is {now} and no longer {ours} "
                     f"({served.last_change})"
                 )
-        return ""
 
     # Carry out what was decided.
 
@@ -272,29 +262,31 @@ class Promotion:
         """
         name, version, served = self._terms.policy, self._terms.version, self._served()
         outcome, why, _ = decided
-        if outcome == PROMOTED and (served is None or served.production != version):
-            changed = self._changed(served)
-            if not changed and self._decided_at not in (None, self._generation):
-                changed = f"someone may have undone this promotion ({served and served.last_change}): start it again"
+        if outcome == PROMOTED and served.uses[IN_USE] != version:
             try:
-                if not changed:
-                    self._change(lambda client: client.alias(name, PRODUCTION, version, expected=self._production))
+                self._check(served)
+                if self._decided_at not in (None, self._generation):
+                    raise ConflictError(
+                        f"someone may have undone this promotion ({served.last_change}): start it again"
+                    )
+                self._change(lambda client: client.alias(name, PRODUCTION, version, expected=self._ours[IN_USE]))
             except ConflictError as error:
-                changed = error.message
-            outcome, why = (STOPPED, changed) if changed else (outcome, why)
-        if served is not None and served.canary == self._canary:
+                outcome, why = STOPPED, error.message
+        if served.uses[CANARY] == self._ours[CANARY]:
             self._change(lambda client: client.canary(name, None))
         # The listing has no shadow that is in production itself.
-        if served is not None and self._shadow != "none" and version in (served.shadow, served.production):
+        if SHADOW in self._ours and version in (served.uses[SHADOW], served.uses[IN_USE]):
             self._change(lambda client: client.shadow(name, None))
-        if (served := self._served()) is not None:
-            why += f"; {served.production} is in production, the canary is {served.canary}"
-        return Outcome(outcome, why)
+        uses = self._served().uses
+        return Outcome(outcome, f"{why}; {uses[IN_USE]} is in production, the canary is {uses[CANARY]}")
 
     # Ask the servers.
 
-    def _served(self) -> _Served | None:
-        """Return the plan of the policy; None if it is not served. Raises RlservoError, also for an older plan."""
+    def _served(self) -> _Served:
+        """Return the plan of the policy, without versions if it is not served.
+
+        Raises RlservoError, also for an older plan.
+        """
         with self._connect(self._terms.urls[0]) as client:
             listing = client.listing()
         try:
@@ -302,17 +294,18 @@ class Promotion:
             if generation < self._generation:  # of a worker or replica that has not followed yet
                 raise UnavailableError(f"the server follows plan {generation}, not yet {self._generation}")
             self._generation = generation
-            policy = next((policy for policy in listing["policies"] if policy["name"] == self._terms.policy), None)
-            if policy is None:
-                return None
-            canary, aliases = policy["canary"], policy["aliases"]
-            return _Served(
-                f"the last change was '{listing['changed_by'].strip()}', at {listing['changed_at'][:19]} UTC",
-                policy["versions"],
-                policy["version"],
-                f"{aliases.get(canary['version'], canary['version'])}={canary['share']:g}" if canary else "none",
-                policy["shadow"]["version"] if policy["shadow"] else "none",
-            )
+            uses: dict[str, str] = {IN_USE: "none", CANARY: "none", SHADOW: "none"}
+            versions: list[str] = []
+            for policy in listing["policies"]:
+                if policy["name"] == self._terms.policy:
+                    canary, shadow, aliases = policy["canary"], policy["shadow"], policy["aliases"]
+                    versions, uses[IN_USE] = policy["versions"], policy["version"]
+                    if canary:
+                        uses[CANARY] = f"{aliases.get(canary['version'], canary['version'])}={canary['share']:g}"
+                    if shadow:
+                        uses[SHADOW] = shadow["version"]
+            last_change = f"the last change was '{listing['changed_by']}', at {listing['changed_at'][:19]} UTC"
+            return _Served(last_change, versions, uses)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UnavailableError(f"the server's listing cannot be read ({error!r})") from None
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.export.contract.errors import UnavailableError, UsageError
 
 ANSWERS, OUTCOMES, ENDS = "rlservo_request_seconds_bucket", "rlservo_requests_total", "rlservo_episode_ends_total"
 DIFFERENCES, MISSED = "rlservo_shadow_difference_bucket", "rlservo_shadow_missed_total"
@@ -33,7 +33,7 @@ COUNTED = {  # the labels that distinguish a policy's series; those of other lab
 Numbers = dict[str, float]  # by "name/label/..."
 
 
-class UntrustedError(Exception):
+class UntrustedError(UsageError):
     """The metrics contradict themselves or an earlier check."""
 
 

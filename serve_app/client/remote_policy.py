@@ -1,4 +1,4 @@
-"""Base of the HTTP and the WebSocket client of a policy: contract, episode, recording, arguments of a request.
+"""Base of the HTTP and the WebSocket client of a policy: all but how a request for an action travels.
 
 A client without a version asks by the policy's name and follows the version that answers: the alias `production`, or a
 canary's share. A recurrent policy stays with the version that began the episode (the server ensures that), and an
@@ -23,12 +23,14 @@ from rlservo.export.contract.errors import (
     DeadlineError,
     RlservoError,
     UnavailableError,
+    UnknownPolicyError,
     UnknownVersionError,
     UsageError,
 )
 from rlservo.serve_app.client.client_episode import ClientEpisode
+from rlservo.serve_app.client.http_transport import Transport
 from rlservo.serve_app.client.observation_encoding import encode_observation
-from rlservo.serve_app.client.replies import answering_version, check_successor
+from rlservo.serve_app.client.replies import answering_version, check_successor, decode_action
 from rlservo.serve_app.interface import ActingPolicy, Observation
 from rlservo.serve_app.recording.start import record_policy
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
@@ -45,12 +47,11 @@ ASK_AGAIN_S = 0.01  # another process may answer next
 
 
 class RemotePolicy(ActingPolicy):
-    """A policy on a server. A transport adds `_act`, `_tell_end`, `_close`, `_fetch_contract`, `_fetch_version`."""
-
-    url: str
+    """A policy on a server. Contracts come over HTTP; a client adds the way of a request for an action."""
 
     def __init__(
         self,
+        transport: Transport,
         policy: str | None,
         *,
         version: str | None,
@@ -60,17 +61,16 @@ class RemotePolicy(ActingPolicy):
         record: str | Path | Recorder | None,
     ) -> None:
         """Check the arguments, then open the recording, so that a failing constructor leaves no file behind."""
-        if not timeout_s > 0:
-            raise UsageError(f"timeout_s must be above 0 seconds, got {timeout_s}")
         if deadline_ms is not None and not deadline_ms > 0:
             raise UsageError(f"deadline_ms must be above 0, got {deadline_ms}")
         if policy == "":
             raise UsageError("the policy name is empty: give a name, or None if the server has only one policy")
         if version is not None and policy is None:
             raise UsageError(f"version {version!r} was given without the policy's name")
+        self.url = transport.url
+        self._transport = transport
         self._name = policy
         self._version = version
-        self._timeout_s = timeout_s
         self._deadline_ms = 1e3 * timeout_s if deadline_ms is None else deadline_ms
         self._episode = episode
         self._contract: Contract | None = None
@@ -93,7 +93,7 @@ class RemotePolicy(ActingPolicy):
         server has several.
         """
         if self._contract is None or self._looks_up:
-            self._meet(self._fetch_contract(None))
+            self._meet(self._fetch_contract(self._version, None))
             assert self._contract is not None
         return self._contract
 
@@ -137,9 +137,10 @@ class RemotePolicy(ActingPolicy):
         end = {"final_status": (final_status or word)[:LONGEST_STATUS], "truncated": truncated and not terminated}
         try:
             request, batch = self._encode_request(final_obs, explore=False, seed=None, reward=None)
-            fields = self._episode.end_fields(self._contract, batch)
-            if fields is not None:
-                self._tell_end({**request, **fields, **end})
+            if self._episode.has_begun:
+                deadline = time.monotonic() + self._deadline_ms / 1e3
+                reply = self._exchange({**request, **end}, batch, deadline, ends=True)
+                answering_version(self.url, reply, request["seq"], self._contract)
         except RlservoError as error:
             logger.warning("the end of the episode was not reported to %s: %s", self.url, error.message)
         self._reward = None
@@ -159,6 +160,9 @@ class RemotePolicy(ActingPolicy):
         """Start an episode. Nothing is sent until the next request."""
         self._episode.reset()
         self._reward = None
+        # A version number needs no lookup.
+        known = self._contract
+        self._looks_up = self._version is not None and known is not None and self._version != known.version
         if self._recording is not None:
             self._recording.begin()
 
@@ -166,7 +170,7 @@ class RemotePolicy(ActingPolicy):
         """End the recording and close the connections to the server; later calls raise UsageError."""
         if self._recording is not None:
             self._recording.end()
-        self._close()
+        self._transport.close()
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
         """Wait until the server offers the policy.
@@ -178,7 +182,7 @@ class RemotePolicy(ActingPolicy):
         while self._contract is None:
             remaining = deadline - time.monotonic()
             try:
-                self._meet(self._fetch_contract(max(min(remaining, LONGEST_TRY_S), 0.01)))
+                self._meet(self._fetch_contract(self._version, max(min(remaining, LONGEST_TRY_S), 0.01)))
             except (UnavailableError, DeadlineError) as error:
                 if time.monotonic() + POLL_S >= deadline:
                     raise UnavailableError(
@@ -186,47 +190,56 @@ class RemotePolicy(ActingPolicy):
                     ) from error
                 time.sleep(POLL_S)
 
-    @abstractmethod
     def _act(self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None = None) -> Any:
         """Request the action, and keep the reply as `last_reply`."""
-        ...
+        _ = self.contract  # the first contact has its own time-out
+        deadline = time.monotonic() + self._deadline_ms / 1e3
+        request, batch = self._encode_request(obs, explore=explore, seed=seed, reward=reward)
+        reply = self._exchange(request, batch, deadline, ends=False)
+        contract = self._answering_contract(reply, request["seq"], deadline)
+        action = decode_action(reply, batch, contract)
+        self._episode.advance(reply, action, contract)
+        self.last_reply, self._reward = reply, None
+        return action
 
     @abstractmethod
-    def _tell_end(self, request: dict[str, Any]) -> None:
-        """Send a request whose action is not used."""
+    def _exchange(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float, *, ends: bool) -> Any:
+        """Send a request with the episode's fields by `deadline` (`time.monotonic`), and return the reply."""
         ...
 
-    @abstractmethod
-    def _close(self) -> None:
-        """Close the connections to the server; harmless when repeated."""
-        ...
+    def _find_name(self, timeout_s: float | None, retries: int | None) -> str:
+        """Return the name of the server's only policy."""
+        return _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s, retries=retries))
 
-    @abstractmethod
-    def _fetch_contract(self, timeout_s: float | None) -> Contract:
-        """Request the contract: once if there is a time-out, otherwise with the client's usual retries."""
-        ...
-
-    @abstractmethod
-    def _fetch_version(self, version: str, deadline: float) -> Contract:
-        """Request the contract of a version, by `deadline` (`time.monotonic`)."""
-        ...
+    def _fetch_contract(self, version: str | None, timeout_s: float | None) -> Contract:
+        """Request a contract: once if there is a time-out, otherwise with the client's usual retries."""
+        retries = None if timeout_s is None else 0
+        name = self._name or (self._contract.name if self._contract else self._find_name(timeout_s, retries))
+        path = ("v1", "policies", name, *(() if version is None else ("versions", version)))
+        document = self._transport.get(*path, timeout_s=timeout_s, retries=retries)
+        try:
+            return Contract.model_validate(document)
+        except ValidationError as error:
+            raise UnavailableError(
+                f"{self.url} sent a contract that this client cannot read: {first_fault(error)} "
+                "(does the server run another version of rlservo?)"
+            ) from error
 
     def _meet(self, contract: Contract) -> None:
-        """Use this contract from now on. Raises UnavailableError."""
-        self._learn(contract)
-        if self._contract is not None and contract is not self._contract:
-            check_successor(contract, self._contract)
-        self._contract, self._looks_up = contract, False
+        """Use this contract from now on; warn if its version was made for another control rate.
 
-    def _learn(self, contract: Contract) -> None:
-        """Store the contract of a version; warn if it was made for another control rate."""
+        Raises UnavailableError if its observations or actions are others.
+        """
         known = self._contract
         if contract.version not in self._contracts and known and known.control_rate_hz != contract.control_rate_hz:
             logger.warning(
                 "version %s of policy '%s' was made for %s Hz, but version %s for %s Hz",
                 contract.version, contract.name, contract.control_rate_hz, known.version, known.control_rate_hz,
             )  # fmt: skip
-        self._contracts.setdefault(contract.version, contract)
+        self._contracts.setdefault(contract.version, contract)  # also if it is refused: it is fetched once
+        if known is not None and contract is not known:
+            check_successor(contract, known)
+        self._contract, self._looks_up = contract, False
 
     def _answering_contract(self, reply: Any, number: int, deadline: float) -> Contract:
         """Return the contract of the version that answered request `number`.
@@ -251,7 +264,6 @@ class RemotePolicy(ActingPolicy):
                     f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' but has no contract "
                     "for it: the action was dropped"
                 )
-            self._learn(known)  # kept even if it is refused next, so that it is not fetched again
         self._meet(known)
         return known
 
@@ -260,7 +272,7 @@ class RemotePolicy(ActingPolicy):
         until = min(deadline, time.monotonic() + FOLLOWED_S)
         while True:
             try:
-                return self._fetch_version(version, deadline)
+                return self._fetch_contract(version, max(deadline - time.monotonic(), 0.001))
             except UnknownVersionError as error:
                 if time.monotonic() + ASK_AGAIN_S >= until:
                     raise UnavailableError(f"{error.message}: the action was dropped", error.details) from error
@@ -269,9 +281,9 @@ class RemotePolicy(ActingPolicy):
     def _encode_request(
         self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None
     ) -> tuple[dict[str, Any], tuple[int, ...]]:
-        """Return (the arguments of `act` as request fields, the batch axis as () or (B,))."""
+        """Return (the arguments of `act` as fields of a numbered request, the batch axis as () or (B,))."""
         encoded, batch = encode_observation(obs, self.contract)
-        request: dict[str, Any] = {"obs": encoded}
+        request: dict[str, Any] = {"obs": encoded, "seq": next(self._numbers)}
         if explore:
             request["explore"] = True
         if seed is not None:
@@ -282,12 +294,15 @@ class RemotePolicy(ActingPolicy):
             request["reward"] = self._reward
         return request, batch
 
-    def _parse_contract(self, document: Any) -> Contract:
-        """Return the contract that the server sent. Raises UnavailableError if it is not one."""
-        try:
-            return Contract.model_validate(document)
-        except ValidationError as error:
-            raise UnavailableError(
-                f"{self.url} sent a contract that this client cannot read: {first_fault(error)} "
-                "(does the server run another version of rlservo?)"
-            ) from error
+
+def _only_policy(listing: Any) -> str:
+    """Return the name of the server's only policy, or raise an error that lists all of them."""
+    policies = listing.get("policies") if isinstance(listing, dict) else None
+    if not isinstance(policies, list):
+        raise UnavailableError("the server's list of policies cannot be read: does it run another version of rlservo?")
+    names = sorted({str(entry["name"]) for entry in policies if isinstance(entry, dict) and "name" in entry})
+    if not names:
+        raise UnknownPolicyError("the server has no policy loaded")
+    if len(names) > 1:
+        raise UsageError(f"the server has {len(names)} policies: name one of {', '.join(names)}", {"policies": names})
+    return names[0]

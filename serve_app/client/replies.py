@@ -21,7 +21,7 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.export.contract.nested import build_action
+from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.export.contract.spaces import LeafSpec, leaf_specs
 from rlservo.serve_app.wire.request_names import MARK
 
@@ -100,25 +100,20 @@ def answering_version(url: str, reply: Any, number: int, contract: Contract) -> 
 
 def check_successor(contract: Contract, known: Contract) -> None:
     """Refuse a version whose observations or actions differ from those of the known one."""
+    differing: list[str] = []
     for word, key in (("observation", "obs"), ("action", "action")):
         theirs, ours = (leaf_specs(getattr(each, f"{word}_space"), key) for each in (contract, known))
-        if theirs != ours or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
-            differing = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
-            raise UnavailableError(
-                f"version {contract.version} of policy '{contract.name}' answers now, and its {word} space differs "
-                "from "
-                f"that of version {known.version}, which this client knows ({', '.join(differing) or word}): the "
-                "action was dropped; make a new client, or one with version=",
-                {"version": contract.version, "known": known.version, "differing": differing},
-            )
+        leaves = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
+        if leaves or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
+            differing += leaves or [f"{word} space"]
     has_reward, had_reward = (any(tensor.name == REWARD for tensor in each.inputs) for each in (contract, known))
-    if has_reward != had_reward:
-        takes = ("does not take", "takes")
+    differing += [REWARD] if has_reward != had_reward else []
+    if differing:
         raise UnavailableError(
-            f"version {contract.version} of policy '{contract.name}' answers now and {takes[has_reward]} the reward; "
-            f"version {known.version}, which this client knows, {takes[had_reward]} it: the action was dropped; create "
-            "a new client, or one with version=",
-            {"version": contract.version, "known": known.version, "differing": [REWARD]},
+            f"version {contract.version} of policy '{contract.name}' answers now, and differs from version "
+            f"{known.version}, which this client knows, in {', '.join(differing)}: the action was dropped; make a new "
+            "client, or one with version=",
+            {"version": contract.version, "known": known.version, "differing": differing},
         )
 
 
@@ -147,41 +142,41 @@ def next_state(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
     return state
 
 
-def decode_action(action: Any, batch: tuple[int, ...], contract: Contract) -> Any:
-    """Return the JSON action in the space's form, arrays of its dtype and shape, or raise ActionError."""
-    return build_action(
-        contract.action_space,
-        {
-            name: _decode_leaf(_part(action, name, contract), batch, name, leaf, contract)
-            for name, leaf in leaf_specs(contract.action_space, "action").items()
-        },
-    )
+def decode_action(reply: Mapping[str, Any], batch: tuple[int, ...], contract: Contract) -> Any:
+    """Return a reply's action in the space's form, arrays of its dtype and shape, or raise ActionError.
+
+    A stream's reply has chunks of one action: an axis of length 1 on each leaf, after the batch's.
+    """
+    if "actions" in reply:
+        return _decode(reply["actions"], batch, (1,), contract)
+    return _decode(reply.get("action"), batch, (), contract)
 
 
 def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
     """Return whether this is an action of the policy for this number of observations."""
     try:
-        decode_action(action, batch, contract)
+        _decode(action, batch, (), contract)
     except ActionError:
         return False
     return True
 
 
-def _part(action: Any, name: str, contract: Contract) -> Any:
-    """Return the leaf `action.<path>` of a nested JSON action, or raise ActionError."""
-    part = action
-    for step in name.split(".")[1:]:
-        if isinstance(part, dict) and step in part:
-            part = part[step]
-        elif isinstance(part, list | tuple) and step.isdigit() and int(step) < len(part):
-            part = part[int(step)]
-        else:
-            raise ActionError(f"the server's action for {contract.name!r} lacks the part {name!r}")
-    return part
+def _decode(action: Any, batch: tuple[int, ...], chunk: tuple[int, ...], contract: Contract) -> Any:
+    space = contract.action_space
+    try:
+        leaves = action_leaves(space, action)
+    except RequestError as error:
+        raise ActionError(f"the server's action for {contract.name!r} cannot be read: {error}") from error
+    specs = leaf_specs(space, "action")
+    return build_action(
+        space, {name: _decode_leaf(leaves[name], batch, chunk, name, specs[name], contract) for name in specs}
+    )
 
 
-def _decode_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec, contract: Contract) -> NDArray[Any]:
-    shape = (*batch, *space.shape)
+def _decode_leaf(
+    action: Any, batch: tuple[int, ...], chunk: tuple[int, ...], name: str, space: LeafSpec, contract: Contract
+) -> NDArray[Any]:
+    shape = (*batch, *chunk, *space.shape)
     what = f"action for {contract.name!r}" if name == "action" else f"{name} for {contract.name!r}"
     try:
         array = np.asarray(action)
@@ -196,4 +191,4 @@ def _decode_leaf(action: Any, batch: tuple[int, ...], name: str, space: LeafSpec
     converted = array.astype(space.dtype)
     if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
         raise ActionError(f"the server's {what} is {str(action)[:80]}, expected {space.dtype}")
-    return converted
+    return converted.reshape((*batch, *space.shape))

@@ -1,26 +1,27 @@
 """WebSocket connection to a policy server: binary frames, each sent and read within a deadline.
 
-The package `websockets` provides the protocol without input and output. Here is a plain socket whose operations all end
-at the given deadline, even if nothing arrives, half a frame, or one byte at a time.
+The HTTP client shakes hands. The package `websockets` provides the protocol without input and output; the socket's
+operations all end at the given deadline, even if nothing arrives, half a frame, or one byte at a time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import socket
-import ssl
 import time
-from typing import cast
 
 from rlservo.export.contract.errors import DeadlineError, UnavailableError
 from rlservo.export.contract.extras import needs_extra
-from rlservo.serve_app.wire.request_names import LABEL_HEADER
+from rlservo.serve_app.client.http_transport import Transport
+from rlservo.serve_app.client.replies import decode_error
 
 with needs_extra("client", what="the WebSocket client"):
     from websockets.client import ClientProtocol
-    from websockets.exceptions import InvalidHandshake, InvalidStatus
+    from websockets.datastructures import Headers
+    from websockets.exceptions import InvalidHandshake
     from websockets.frames import Frame, Opcode
     from websockets.http11 import Response
+    from websockets.protocol import Protocol, Side
     from websockets.uri import parse_uri
 
 MAX_FRAME_BYTES = 64 << 20  # larger than any action or contract
@@ -30,51 +31,32 @@ RECEIVE_BYTES = 65536
 class WebSocket:
     """An open connection; any failure closes it and raises BrokenError."""
 
-    def __init__(self, url: str, *, api_key: str | None, deadline: float, label: str) -> None:
-        """Connect and shake hands by `deadline` (`time.monotonic`).
+    def __init__(self, transport: Transport, path: str, deadline: float) -> None:
+        """Shake hands by `deadline` (`time.monotonic`).
 
-        `label` names the connection's owner: during a canary, all connections with one label get the same version.
-
-        Raises BrokenError, or HandshakeError when the server answers with an HTTP error.
+        Raises BrokenError, DeadlineError, or what the server names.
         """
-        self._url = url
-        uri = parse_uri(url)
-        self._protocol = ClientProtocol(uri, max_size=MAX_FRAME_BYTES)
+        self._url = url = transport.url
+        client = ClientProtocol(parse_uri(f"{url}{path}"))
+        offered = [(n.encode(), v.encode()) for n, v in client.connect().headers.raw_items() if n != "Host"]
+        try:
+            self._response, first = transport.upgrade(path, offered, deadline)
+        except UnavailableError as error:
+            raise BrokenError(error.message, error.details) from error
+        if self._response.status != 101:
+            raise decode_error(url, self._response.status, first)
+        self._socket: socket.socket = self._response.extensions["network_stream"].get_extra_info("socket")
+        self._protocol = Protocol(Side.CLIENT, max_size=MAX_FRAME_BYTES)
         self._pieces: list[bytes] = []
         self._text = False
+        headers = Headers([(name.decode("latin-1"), value.decode("latin-1")) for name, value in self._response.headers])
         try:
-            self._socket = socket.create_connection((uri.host, uri.port), timeout=_remaining(deadline))
-        except OSError as error:
-            raise BrokenError(f"{url} cannot be reached: {error}") from error
-        try:
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if uri.secure:
-                self._socket = ssl.create_default_context().wrap_socket(self._socket, server_hostname=uri.host)
-            request = self._protocol.connect()
-            request.headers["User-Agent"] = "rlservo-client"
-            request.headers[LABEL_HEADER] = label
-            if api_key is not None:
-                request.headers["Authorization"] = f"Api-Key {api_key}"
-            self._protocol.send_request(request)
-            self._flush(deadline)
-            while not self._protocol.handshake_exc and self._protocol.state.name == "CONNECTING":
-                self._receive_bytes(deadline)
-            failure = self._protocol.handshake_exc
-            if isinstance(failure, InvalidStatus):
-                raise HandshakeError(failure.response.status_code, bytes(failure.response.body or b""))
-            if isinstance(failure, InvalidHandshake):
-                raise BrokenError(f"{url} is not a stream ({failure}): is it an rlservo server?")
-            if failure is not None:
-                raise BrokenError(f"{url} dropped the connection: {failure}")
-        except (OSError, ssl.SSLError) as error:
+            client.process_response(Response(101, "", headers))
+        except InvalidHandshake as failure:
             self.close()
-            raise BrokenError(f"{url} cannot be reached: {error}") from error
-        except BaseException:
-            self.close()
-            raise
-        response, *self._events = self._protocol.events_received()
-        self.headers = cast("Response", response).headers
-        """Headers of the handshake's response."""
+            raise BrokenError(f"{url} is not a stream ({failure}): is it an rlservo server?") from failure
+        self._protocol.receive_data(first)
+        self._events = self._protocol.events_received()
         self.last_receive_at = time.monotonic()
         """Time of the server's last bytes."""
 
@@ -121,7 +103,7 @@ class WebSocket:
             self._protocol.send_close(1000)
             self._flush(time.monotonic() + 0.05)
         with contextlib.suppress(OSError):
-            self._socket.close()
+            self._response.close()
 
     def _message(self, frame: object) -> bytes | str | None:
         """Return a message when `frame` completes one."""
@@ -155,15 +137,6 @@ class BrokenError(UnavailableError):
     """The connection is missing or closed: a new one may be opened."""
 
     code = "connection-broken"
-
-
-class HandshakeError(Exception):
-    """The server answered the upgrade with an HTTP error."""
-
-    def __init__(self, status: int, body: bytes) -> None:
-        super().__init__(f"the server answered {status}")
-        self.status = status
-        self.body = body
 
 
 def _remaining(deadline: float) -> float:

@@ -56,48 +56,32 @@ class Admission:
         """Take the settings; `reward` replaces the rewards that clients report."""
         self._policy, self.max_age, self._reward = policy, max_age, reward
 
-    def parts(self, episode: Episode) -> list[Episode]:
-        """Split a recorded episode where the reward function ends one.
-
-        Without an end, the last decision only serves as the observation after the previous one.
-        """
-        ours = episode.policy.contract.name == self._policy
-        if self._reward is None or not ours or episode.goes_on or _why_not_drawn(episode) is not None:
-            return [episode]
-        ends = [row + 1 for row, (_, ended) in enumerate(_computed(episode, self._reward)) if ended]
-        length = len(episode) if episode.ended else len(episode) - 1
-        if not ends and (episode.ended or length < 1):
-            return [episode]
-        begins = [0, *ends]
-        parts = [episode.part(begin, end, terminated=True) for begin, end in zip(begins, ends, strict=False)]
-        if begins[-1] < length:
-            parts.append(episode.part(begins[-1], length, terminated=episode.terminated))
-        return parts
-
     def judge(
         self, episode: Episode, versions: Sequence[KnownVersion], *, any_age: bool = False
-    ) -> Admitted | str | None:
-        """Return the episode, or the reason to drop it; None if it is another policy's. `versions`: newest last."""
+    ) -> list[Admitted | str]:
+        """Return a recorded episode, or the reason to drop it; nothing of another policy. `versions`: newest last.
+
+        It is in parts where the reward function ends one.
+        """
         contract = episode.policy.contract
         if contract.name != self._policy:
-            return None
+            return []
         place = next((i for i, known in enumerate(versions) if known.version == contract.version), None)
         if place is None:
-            return "of a version that this run did not make"
+            return ["of a version that this run did not make"]
         known, age = versions[place], len(versions) - 1 - place
         if (episode.policy.graph_hash, episode.policy.contract_hash) != (known.graph_sha256, known.contract_sha256):
-            return "whose graph or contract is not the version's"
+            return ["whose graph or contract is not the version's"]
         if age > self.max_age and not any_age:
-            return "of a version that is too old"
-        if (reason := why_not_whole(episode) or _why_not_drawn(episode)) is not None:
-            return reason
-        rewards = episode.reward
-        if self._reward is not None:
-            rewards = np.full(len(episode), np.nan)  # the last reward needs the observation after it
-            computed = [reward for reward, _ in _computed(episode, self._reward)]
-            rewards[: len(computed)] = computed
-        reason = why_without_reward(episode, rewards)
-        return Admitted(episode, known, age, rewards) if reason is None else reason
+            return ["of a version that is too old"]
+        not_drawn, parts = _why_not_drawn(episode), [(episode, episode.reward)]
+        if self._reward is not None and not (not_drawn or episode.goes_on or episode.gap is not None):
+            parts = _rewarded(episode, self._reward)
+        verdicts: list[Admitted | str] = []
+        for part, rewards in parts:
+            reason = why_not_whole(part) or not_drawn or why_without_reward(part, rewards)
+            verdicts.append(reason or Admitted(part, known, age, rewards))
+        return verdicts
 
 
 def _why_not_drawn(episode: Episode) -> str | None:
@@ -135,22 +119,32 @@ def _why_not_sent(episode: Episode) -> str | None:
     return None
 
 
-def _computed(episode: Episode, reward: Reward) -> list[tuple[float, bool]]:
-    """Return each action's reward and whether it ended the episode; the last needs the observation after it."""
+def _rewarded(episode: Episode, reward: Reward) -> list[tuple[Episode, NDArray[np.float64]]]:
+    """Return the parts of an episode that the reward function ends, with their rewards.
+
+    Without an end, the last decision only serves as the observation after the previous one.
+    """
     contract = episode.policy.contract
     final: Columns | None = episode.final_obs
     seen = [row_of(contract.observation_space, episode.obs, row, "obs") for row in range(len(episode))]
     if final is not None:
         seen.append(row_of(contract.observation_space, final, 0, "obs"))
-    found = []
+    rewards, ends = np.full(len(episode), np.nan), []  # the last reward needs the observation after it
     try:
         for row, after in enumerate(seen[1:]):
             result = reward(seen[row], row_of(contract.action_space, episode.action, row, "action"), after)
-            value, ended = result if isinstance(result, tuple) else (result, False)
-            found.append((float(value), bool(ended)))
+            rewards[row], is_end = result if isinstance(result, tuple) else (result, False)
+            ends += [row + 1] if is_end else []
     except Exception as error:  # the user's own code
         raise UsageError(f"the reward function failed: {first_line(error)}") from error
-    return found
+    length = len(episode) if episode.ended else len(episode) - 1
+    if not ends and (episode.ended or length < 1):
+        return [(episode, rewards)]
+    begins = [0, *ends]
+    pieces = [(begin, end, True) for begin, end in zip(begins, ends, strict=False)]
+    if begins[-1] < length:
+        pieces.append((begins[-1], length, episode.terminated))
+    return [(episode.part(i, j, terminated=terminated), rewards[i:j]) for i, j, terminated in pieces]
 
 
 def reward_of(source: str, name: str) -> Reward:

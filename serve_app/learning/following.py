@@ -76,7 +76,7 @@ class FollowedRecordings:
         self._folders = [*(folder.absolute() for folder in folders), *(server.folder for server in servers)]
         self._notify = notify
         self._policies = Recording([])  # one object for the same policy of several files
-        self._files: dict[Path, tuple[FileFacts, FileReader, int]] = {}
+        self._files: dict[Path, tuple[FileFacts, FileReader]] = {}
         self._writers: dict[str, EpisodeAssembler] = {}
 
     def names(self) -> set[str]:
@@ -91,14 +91,12 @@ class FollowedRecordings:
             except (UnavailableError, DeadlineError) as error:
                 self._progress(f"waiting for recordings: {error.message}")
         for path in self._paths():
-            facts, reader, size = self._files.get(path) or self._open(path)
-            try:
-                now = path.stat().st_size
-            except FileNotFoundError:  # the oldest files are deleted while servers record
+            if path not in self._files:
+                facts = FileFacts(path)
+                self._files[path] = facts, FileReader(self._policies, facts)
+            facts, reader = self._files[path]
+            if facts.whole or facts.damage is not None:
                 continue
-            if facts.whole or facts.damage is not None or now == size:
-                continue
-            self._files[path] = facts, reader, now
             assembler = self._writers.setdefault(_writer_of(path), EpisodeAssembler())
             try:
                 for entry in reader.entries():
@@ -108,14 +106,12 @@ class FollowedRecordings:
                 facts.damage = error.message
                 self._notify(f"{error.message}: left out")
                 continue
+            except FileNotFoundError:  # the oldest files are deleted while servers record
+                continue
             except OSError as error:
                 facts.damage = error.strerror or str(error)
             if facts.damage is not None:
                 self._notify(f"{path} is not read any further: {facts.damage}")
-
-    def _open(self, path: Path) -> tuple[FileFacts, FileReader, int]:
-        facts = FileFacts(path)
-        return facts, FileReader(self._policies, facts), 0
 
     def _paths(self) -> list[Path]:
         return [path for folder in self._folders for path in sorted(folder.glob(f"*{SUFFIX}"))]

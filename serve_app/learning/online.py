@@ -7,39 +7,23 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 from rlservo.export.contract.errors import BundleError, CheckpointError, ParityError, UnsupportedError, UsageError
-from rlservo.serve_app.learning.admission import Admission, Admitted, KnownVersion
+from rlservo.serve_app.learning.admission import Admission, Admitted
 from rlservo.serve_app.learning.following import FollowedRecordings
 from rlservo.serve_app.learning.release import Release
 from rlservo.serve_app.learning.rllib_episodes import single_agent_episode
 from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 from rlservo.serve_app.learning.run_folder import RunFolder
-from rlservo.serve_app.recording.episodes import Episode
 
 POLL_S = 0.5
 KEPT_LOADED = 3  # versions kept besides those that may be learned from: robots finish their episodes with them
 GATE = (ParityError, CheckpointError, UnsupportedError, BundleError)
 """The errors with which an export refuses a version."""
-
-
-@dataclass
-class _Batch:
-    """The episodes of one update."""
-
-    admitted: list[Admitted] = field(default_factory=list)
-    dropped: Counter[str] = field(default_factory=Counter)
-    steps: int = 0
-
-    @property
-    def dropped_text(self) -> str:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in self.dropped.items())
-        return f"{self.dropped.total()} ({reasons})" if reasons else "0"
 
 
 class OnlineLearning:
@@ -75,8 +59,7 @@ class OnlineLearning:
         state = self._run.state
         if self._run.is_new:
             self._release.check_unclaimed()
-            self._keep(self._release.publish(self._learner.save))
-            self._say(f"version {state.versions[-1].version} is the checkpoint itself")
+            self._make_version()  # the checkpoint itself
         else:
             self._learner.restore(self._run.checkpoint(state.versions[-1].version))
             self._serve_newest()
@@ -91,30 +74,27 @@ class OnlineLearning:
     # Versions.
 
     def _make_version(self) -> bool:
-        """Release the learned version; return whether robots get it. If not, continue from the last version."""
+        """Release the learned version; return whether robots get it. If not, continue from the last version.
+
+        Raises the gate's error or UsageError if it is the first.
+        """
+        state = self._run.state
         try:
-            known = self._release.publish(self._learner.save)
+            state.versions.append(self._release.publish(self._learner.save))
         except GATE as error:
+            if not state.versions:
+                raise
             self._refuse(f"the gate refused it: {error.message}")
             return False
-        if not self._keep(known):
-            return False
-        self._say(f"version {known.version} is proven, published and loaded after {self._run.state.updates} updates")
-        return True
-
-    def _keep(self, known: KnownVersion) -> bool:
-        """Record a version, and serve it to robots; return whether they get it."""
-        state = self._run.state
-        state.versions.append(known)
         self._run.commit(self._recordings.names())
         if not self._serve_newest():
             return False
-        self._forget_unproven()
+        self._unproven, self._fresh = [], 0
         too_old = len(state.versions) - self._admission.max_age - KEPT_LOADED
         if too_old > 0:
-            old = state.versions[too_old - 1].version
-            self._learner.forget(self._run.checkpoint(old))
-            self._release.unload(old)
+            self._release.unload(state.versions[too_old - 1].version)
+        newest = state.versions[-1].version
+        self._say(f"version {newest} is proven, published and loaded after {state.updates} updates")
         return True
 
     def _serve_newest(self) -> bool:
@@ -141,91 +121,86 @@ class OnlineLearning:
         self._say(f"no version was released: {why}")
         self._learner.restore(self._run.checkpoint(newest), forget=self._fresh)
         state.unproven += self._unproven
-        self._forget_unproven()
+        self._unproven, self._fresh = [], 0
         state.refused += 1
         self._run.commit(self._recordings.names())
         self._say(f"learning continues from version {newest}")
-
-    def _forget_unproven(self) -> None:
-        self._unproven.clear()
-        self._fresh = 0
 
     # Updates.
 
     def _update(self) -> None:
         state = self._run.state
-        batch = self._draw()
-        raw, seen = [], []
-        for number, one in enumerate(batch.admitted):
-            made = _made(one, f"{state.episodes + number}")
-            raw.append(made)
-            seen += self._learner.seen([made], self._run.checkpoint(one.version.version))
+        batch, dropped = self._draw()
+        raw = [_made(one, f"{state.episodes + number}") for number, one in enumerate(batch)]
+        seen = [self._seen(one, made) for one, made in zip(batch, raw, strict=True)]
+        steps = sum(map(len, raw))
         losses = self._learner.update(raw, seen, state.steps)
         state.updates += 1
-        state.episodes += len(batch.admitted)
-        self._fresh += len(batch.admitted)
-        state.steps += batch.steps
-        acted = Counter(one.version.version for one in batch.admitted)
-        returns, ages = [one.rewards.sum() for one in batch.admitted], [one.age for one in batch.admitted]
+        state.episodes += len(batch)
+        self._fresh += len(batch)
+        state.steps += steps
+        acted = Counter(one.version.version for one in batch)
+        returns, ages = [one.rewards.sum() for one in batch], [one.age for one in batch]
         self._say(
-            f"update {state.updates:>4}  episodes {len(batch.admitted):>3}  steps {batch.steps:>5}  "
+            f"update {state.updates:>4}  episodes {len(batch):>3}  steps {steps:>5}  "
             f"return {np.mean(returns):>9.2f}  acted {' '.join(f'{v}:{n}' for v, n in sorted(acted.items()))}  "
             f"age {np.mean(ages):.1f}  kl {losses.get('mean_kl_loss', float('nan')):.2g}  "
-            f"dropped {batch.dropped_text}"
+            f"dropped {_counted(dropped)}"
         )
 
-    def _draw(self) -> _Batch:
-        """Wait for the episodes of the next update and return them."""
-        batch = _Batch()
+    def _draw(self) -> tuple[list[Admitted], Counter[str]]:
+        """Wait for the episodes of the next update; return them, and those that were dropped meanwhile, by reason."""
+        batch: list[Admitted] = []
+        dropped: Counter[str] = Counter()
         wanted = self._learner.steps_wanted
-        while batch.steps < wanted:
+        while (steps := sum(len(one.episode) for one in batch)) < wanted:
             one = next(self._source)
             if isinstance(one, Admitted):
-                batch.admitted.append(one)
-                batch.steps += len(one.episode)
+                batch.append(one)
             elif one is not None:
-                batch.dropped[one] += 1
+                dropped[one] += 1
                 self._run.state.dropped[one] += 1
             else:
                 self._progress(
-                    f"waiting for exploring episodes: {batch.steps} of {wanted} steps, dropped {batch.dropped_text}"
+                    f"waiting for exploring episodes: {steps} of {wanted} steps, dropped {_counted(dropped)}"
                 )
                 self._sleep(POLL_S)
-        return batch
+        return batch, dropped
 
     def _admitted(self) -> Iterator[Admitted | str | None]:
         """Yield an episode, or the reason to drop it; None if no more have ended yet."""
         state = self._run.state
         while True:
             for ended in self._recordings.poll():
-                place, parts = (ended.file, ended.key), self._admission.parts(ended.episode)
-                if place in self._used:
-                    self._remember(ended.key, parts)
+                place = (ended.file, ended.key)
+                is_used = place in self._used  # before a restart
+                if is_used and (not self._learner.replays or ended.key in state.unproven):
                     continue
-                verdicts = [self._admission.judge(part, state.versions) for part in parts]
-                if not any(verdicts):  # another policy's
-                    continue
-                self._used.add(place)
-                state.used.setdefault(ended.file, []).append(ended.key)
-                if any(isinstance(verdict, Admitted) for verdict in verdicts):
-                    self._unproven.append(ended.key)
-                yield from verdicts
+                verdicts = self._admission.judge(ended.episode, state.versions, any_age=is_used)
+                admitted = [one for one in verdicts if isinstance(one, Admitted)]
+                if is_used:
+                    made = [_made(one, f"{ended.key}.{number}") for number, one in enumerate(admitted)]
+                    self._learner.remember([self._seen(one, own) for one, own in zip(admitted, made, strict=True)])
+                elif verdicts:
+                    self._used.add(place)
+                    state.used.setdefault(ended.file, []).append(ended.key)
+                    self._unproven += [ended.key] if admitted else []
+                    yield from verdicts
             yield None
 
-    def _remember(self, key: str, parts: Sequence[Episode]) -> None:
-        """Return an episode from before a restart to a learner that replays."""
-        state = self._run.state
-        if not self._learner.replays or key in state.unproven:
-            return
-        for number, part in enumerate(parts):
-            one = self._admission.judge(part, state.versions, any_age=True)
-            if isinstance(one, Admitted):
-                made = _made(one, f"{key}.{number}")
-                self._learner.remember(self._learner.seen([made], self._run.checkpoint(one.version.version)))
+    def _seen(self, one: Admitted, made: Any) -> Any:
+        """Return an episode as the network of the version that acted saw it."""
+        (seen,) = self._learner.seen([made], self._run.checkpoint(one.version.version))
+        return seen
 
 
 def _made(one: Admitted, id_: str) -> Any:
     return single_agent_episode(one.episode, one.episode.own_action, one.rewards, id_=id_, with_distribution=True)
+
+
+def _counted(dropped: Counter[str]) -> str:
+    reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+    return f"{dropped.total()} ({reasons})" if reasons else "0"
 
 
 def why_interrupted(run: RunFolder) -> str:

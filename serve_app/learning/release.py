@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -23,7 +23,6 @@ from rlservo.export.contract.errors import (
 from rlservo.export.export_checkpoint import export_checkpoint, silent
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.promotion import INTERRUPTED, PROMOTED, ROLLED_BACK, Promotion, Terms
-from rlservo.serve_app.client.promotion_evidence import Limits
 from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.interface import PRODUCTION
 from rlservo.serve_app.learning.admission import KnownVersion, Reward, named_reward
@@ -32,20 +31,10 @@ from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.repository.publication import next_version, publish
 
 RETRY_S = 2.0
+EVERY_S = 5.0  # between two checks of a canary
 ATTEMPTS = 5  # to get a version number, each after another publisher has taken one
 
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class Canary:
-    """Conditions under which a version is watched before all robots get it."""
-
-    share: float
-    """Share of the sessions."""
-    seconds: float
-    limits: Limits
-    every_s: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -56,8 +45,8 @@ class Target:
     repository: str
     """A folder or URI, one of the server's repositories."""
     alias: str
-    canary: Canary | None = None
-    """If given, versions go to production through a canary, and no alias is moved."""
+    canary: Terms | None = None
+    """If given, versions go to production by promotions on these terms, and no alias is moved."""
 
 
 class Release:
@@ -69,14 +58,13 @@ class Release:
         run: RunFolder,
         connect: Callable[[], AdminClient],
         *,
-        url: str,
         app_dir: Path,
         progress: Callable[[str], object],
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`connect` makes a client of `url` with the current admin key; `progress` takes the current activity."""
+        """`connect` makes a client of the server with the current admin key; `progress` takes the current activity."""
         self._target, self._run, self._connect = target, run, connect
-        self._url, self._reward = url, ""
+        self._reward = ""
         self._app_dir, self._progress, self._sleep = app_dir, progress, sleep
 
     def named_reward(self) -> Reward | None:
@@ -84,13 +72,8 @@ class Release:
 
         None if it names none. Raises UsageError if it cannot be loaded.
         """
-
-        def ask() -> str:
-            with self._connect() as client:
-                return str(client.contract(self._target.policy).get("reward", ""))
-
         with suppress(UnknownPolicyError):  # not served before its first version
-            self._reward = self._until_reached(ask)
+            self._reward = self._ask(lambda client: str(client.contract(self._target.policy).get("reward", "")))
         return named_reward(self._reward) if self._reward else None
 
     def publish(self, save: Callable[[Path], None]) -> KnownVersion:
@@ -119,7 +102,7 @@ class Release:
     def check_unclaimed(self) -> None:
         """Raise ConflictError if a new run's alias already points to a version, as another learner may move it."""
         name, alias = self._target.policy, self._target.alias
-        there = None if self._target.canary else self._until_reached(lambda: self._aliases().get(alias))
+        there = None if self._target.canary else self._aliases().get(alias)
         if there is not None:
             raise ConflictError(
                 f"alias '{alias}' of policy '{name}' already points to version {there}: is another learner moving it? "
@@ -134,12 +117,12 @@ class Release:
         alias.
         """
         try:
-            self._until_reached(lambda: self._load(version))
+            self._ask(lambda client: client.load(self._target.policy, version))
         except RefusedError as error:
             return error.message
         if self._target.canary is not None:
             return self._promote(version, self._target.canary)
-        self._until_reached(lambda: self._move(version, before))
+        self._move(version, before)
         return None
 
     def unload(self, version: str) -> None:
@@ -150,14 +133,9 @@ class Release:
         except RlservoError as error:
             self._progress(f"version {version} stays loaded: {error.message}")
 
-    def _load(self, version: str) -> None:
-        with self._connect() as client:
-            client.load(self._target.policy, version)
-
     def _aliases(self) -> dict[str, str]:
-        with self._connect() as client:
-            served: dict[str, dict[str, str]] = {one["name"]: one["aliases"] for one in client.listing()["policies"]}
-        return served.get(self._target.policy, {})
+        policies = self._ask(lambda client: client.listing()["policies"])
+        return next((dict(one["aliases"]) for one in policies if one["name"] == self._target.policy), {})
 
     def _move(self, version: str, before: str | None) -> None:
         name, alias = self._target.policy, self._target.alias
@@ -169,20 +147,19 @@ class Release:
                 f"alias '{alias}' of policy '{name}' points to version {there}, but this run had moved it to {before}: "
                 "is another learner moving it? Give each run its own --alias"
             )
-        with self._connect() as client:
-            client.alias(name, alias, version, expected=there)
+        self._ask(lambda client: client.alias(name, alias, version, expected=there))
 
-    def _promote(self, version: str, canary: Canary) -> str | None:
+    def _promote(self, version: str, terms: Terms) -> str | None:
         """Put a version into production as `rlservo policy promote` does, resuming from its log."""
-        name, log = self._target.policy, self._run.path / "promotions" / f"{version}.jsonl"
-        if self._until_reached(lambda: self._aliases().get(PRODUCTION)) == version:
+        log = self._run.path / "promotions" / f"{version}.jsonl"
+        if self._aliases().get(PRODUCTION) == version:
             return None
-        terms = Terms((self._url,), name, version, canary.share, canary.seconds, canary.limits)
+        terms = replace(terms, version=version)
         log.parent.mkdir(exist_ok=True)
         with PromotionLog.open(log) as opened:
             try:
                 outcome = Promotion(
-                    lambda _url: self._connect(), terms, opened, every_s=canary.every_s, say=self._progress
+                    lambda _url: self._connect(), terms, opened, every_s=EVERY_S, say=self._progress
                 ).run()
             except UsageError as error:  # for example another learner's canary
                 raise ConflictError(f"version {version} was not promoted: {error.message}") from None
@@ -191,6 +168,15 @@ class Release:
         if outcome.outcome not in (PROMOTED, ROLLED_BACK):
             raise ConflictError(f"version {version} was not promoted: {outcome.why}")
         return outcome.why if outcome.outcome == ROLLED_BACK else None
+
+    def _ask(self, question: Callable[[AdminClient], Result]) -> Result:
+        """Return the server's answer, however long that takes."""
+
+        def ask() -> Result:
+            with self._connect() as client:
+                return question(client)
+
+        return self._until_reached(ask)
 
     def _until_reached(self, change: Callable[[], Result]) -> Result:
         """Return the result of `change`, which is retried until the server or the storage is reachable."""

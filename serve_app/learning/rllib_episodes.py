@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,75 +18,11 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.nested import build_action
 from rlservo.export.rllib import private_names
 from rlservo.export.rllib.new_connectors import PLUMBING
-from rlservo.serve_app.recording.conversion import episodes_of_one
 from rlservo.serve_app.recording.episodes import Columns, Episode
-from rlservo.serve_app.recording.own_actions import OwnActions, modes, own_actions
-from rlservo.serve_app.recording.reader import Recording
 
 AT_ONCE = 256  # episodes per pass of a pipeline
 CANNOT_LEARN = ("FrameStacking",)
 """Connector pieces that add nothing to the episode, so that a learner would need a second one."""
-
-
-@dataclass
-class Recorded:
-    """Episodes for a learner: observations as the environment gave them, the module's own actions."""
-
-    contract: Any
-    episodes: list[SingleAgentEpisode] = field(default_factory=list)
-    """In the form that `env.step` gives; not yet passed through connectors."""
-    not_used: dict[str, int] = field(default_factory=dict)
-    """Unusable episodes, by reason."""
-    own: int = 0
-    """Decisions whose own action was recorded."""
-    inverted: int = 0
-    """Decisions whose own action is the inverse of the executed one."""
-    clipped: int = 0
-    """Number of those at or beyond a bound."""
-
-    @property
-    def decisions(self) -> int:
-        return self.own + self.inverted
-
-    @property
-    def mean_return(self) -> float:
-        return float(np.mean([episode.get_return() for episode in self.episodes]))
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Selection of episodes, and of the actions to learn from them."""
-
-    rewards: bool = True
-    """Whether the learner needs rewards, and the observation after the end of a truncated episode."""
-    status: str | None = None
-    """Only episodes with this final status."""
-    modes: bool = False
-    """Whether to learn the most likely action of a recorded distribution instead of the drawn one."""
-    ahead: int = 0
-    """Number of cycles by which the action learned for an observation comes later."""
-
-
-def read_recordings(recording: Recording, choice: Choice | None = None, *, name: str | None = None) -> Recorded:
-    """Return the whole episodes of one policy that are usable for learning.
-
-    Raises UsageError if none can be used, and RecordingError.
-    """
-    chosen = choice or Choice()
-    recorded: Recorded | None = None
-    for episode in episodes_of_one(recording, name):
-        recorded = recorded or Recorded(episode.policy.contract)
-        own = modes(episode) if chosen.modes else own_actions(episode)
-        reason = _why_not(episode, own, chosen)
-        if reason is None:
-            _add(recorded, episode, own, chosen.ahead)
-        else:
-            recorded.not_used[reason] = recorded.not_used.get(reason, 0) + 1
-    assert recorded is not None, "episodes_of_one raises if there are none"
-    if not recorded.episodes:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in recorded.not_used.items())
-        raise UsageError(f"no recorded episode can be learned from: {reasons}")
-    return recorded
 
 
 def why_not_whole(episode: Episode) -> str | None:
@@ -151,24 +86,6 @@ def single_agent_episode(
 def row_of(space: Any, columns: Mapping[str, Any], row: int, name: str) -> Any:
     """Return one row of a space's leaves in the space's own form."""
     return build_action(space, {key: leaf[row] for key, leaf in columns.items()}, name)
-
-
-def _why_not(episode: Episode, own: OwnActions, choice: Choice) -> str | None:
-    if (reason := why_not_whole(episode)) is not None:
-        return reason
-    if choice.status is not None and episode.final_status != choice.status:
-        return f"that did not end in {choice.status!r}"
-    if not own.known.all():
-        return "without all of the module's own actions"
-    return why_without_reward(episode, episode.reward) if choice.rewards else None
-
-
-def _add(recorded: Recorded, episode: Episode, own: OwnActions, ahead: int) -> None:
-    recorded.own += int(own.recorded.sum())
-    recorded.inverted += int((~own.recorded).sum())
-    recorded.clipped += int(own.clipped.sum())
-    id_ = f"{len(recorded.episodes)}"  # RLlib numbers episodes with "_" behind their ids
-    recorded.episodes.append(single_agent_episode(episode, own.leaves, episode.reward, id_=id_, ahead=ahead))
 
 
 def through_connectors(

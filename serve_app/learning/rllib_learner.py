@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,6 +33,7 @@ ALGORITHMS = {"PPO": 1, "APPO": 3, "SAC": 10}
 """Default age of the oldest version that each learns from, in versions behind the newest: PPO clips the ratio to it,
 APPO corrects with V-trace, SAC replays."""
 LEARNER_GROUP = "learner_group"
+MOST_ACTING = 16  # versions whose connectors are kept
 
 
 class OnlineLearner:
@@ -57,7 +59,7 @@ class OnlineLearner:
         except Exception as error:  # the configuration may name third-party code
             raise CheckpointError(f"{start}: its learner cannot be built: {first_line(error)}") from error
         self._first_steps = read_facts(self._files.root, lambda _sentence: None).env_steps or 0
-        self._acting: dict[Path, EnvToModulePipeline] = {}
+        self._acting = lru_cache(MOST_ACTING)(self._pipeline)
         self._env_to_module = pipeline
         self.restore(self._files.root)
 
@@ -91,13 +93,7 @@ class OnlineLearner:
 
     def seen(self, episodes: Sequence[SingleAgentEpisode], acting: Path) -> list[SingleAgentEpisode]:
         """Return episodes as the network of the checkpoint `acting` saw them; its filter is not changed."""
-        if acting not in self._acting:
-            self._acting[acting] = self._pipeline(acting)
-        return through_connectors(episodes, self._acting[acting])
-
-    def forget(self, acting: Path) -> None:
-        """Forget the connectors of a version that is too old to learn from."""
-        self._acting.pop(acting, None)
+        return through_connectors(episodes, self._acting(acting))
 
     def update(
         self, raw: Sequence[SingleAgentEpisode], seen: Sequence[SingleAgentEpisode], steps: int

@@ -5,7 +5,6 @@ Transitions are drawn uniformly, even if the checkpoint's configuration asks for
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,29 +18,22 @@ class Replay:
     def __init__(self, config: Any) -> None:
         """Take the sizes from an off-policy algorithm's configuration."""
         self._config = config
-        self._capacity = int(config.replay_buffer_config["capacity"])
-        self._kept: deque[SingleAgentEpisode] = deque()
-        self._buffer = EpisodeReplayBuffer(capacity=self._capacity)
+        self._buffer = EpisodeReplayBuffer(capacity=int(config.replay_buffer_config["capacity"]))
 
     @property
     def missing(self) -> int:
         """Number of steps still missing before learning starts, by the configuration."""
-        return max(0, int(self._config.num_steps_sampled_before_learning_starts) - sum(map(len, self._kept)))
+        return max(0, int(self._config.num_steps_sampled_before_learning_starts) - self._buffer.get_num_timesteps())
 
     def add(self, episodes: Sequence[SingleAgentEpisode]) -> None:
-        """Add the newest episodes, and drop the oldest beyond the capacity."""
-        self._kept += episodes
-        while sum(map(len, self._kept)) > self._capacity and len(self._kept) > 1:
-            self._kept.popleft()
+        """Add the newest episodes; the oldest beyond the capacity are dropped."""
         self._buffer.add(list(episodes))
 
     def forget(self, count: int) -> None:
         """Drop the newest `count` episodes."""
-        for _ in range(min(count, len(self._kept))):
-            self._kept.pop()
-        self._buffer = EpisodeReplayBuffer(capacity=self._capacity)
-        if self._kept:
-            self._buffer.add(list(self._kept))
+        kept = list(self._buffer.episodes)[:-count]
+        self._buffer = EpisodeReplayBuffer(capacity=self._buffer.capacity)
+        self._buffer.add(kept)
 
     def updates(self, steps: int) -> int:
         """Return the number of updates for this many new steps: by `training_intensity`, or one per sampling."""

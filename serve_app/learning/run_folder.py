@@ -7,15 +7,17 @@ learned again from the same episodes, which count as used only once a version in
 from __future__ import annotations
 
 import fcntl
-import json
 import os
 import shutil
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
+from rlservo.export.contract.contract import first_fault
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.interface import Closeable
 from rlservo.serve_app.learning.admission import KnownVersion
@@ -43,6 +45,9 @@ class State:
     """Versions that the gate refused, or whose canary was rolled back."""
     unproven: list[str] = field(default_factory=list)
     """The used episodes of the refused versions."""
+
+
+STATE = TypeAdapter(State)
 
 
 class RunFolder(Closeable):
@@ -93,8 +98,8 @@ class RunFolder(Closeable):
         state = self.state
         state.used = {file: keys for file, keys in state.used.items() if file in present}
         part = self.path / f"{STATE_FILE}.part"
-        with part.open("w") as stream:
-            json.dump({**vars(state), "versions": [asdict(known) for known in state.versions]}, stream, indent=1)
+        with part.open("wb") as stream:
+            stream.write(STATE.dump_json(state, indent=1))
             stream.flush()
             os.fsync(stream.fileno())
         part.replace(self.path / STATE_FILE)
@@ -117,11 +122,10 @@ class RunFolder(Closeable):
                 shown.write_text(reward_source)
             return State(terms)
         try:
-            document = json.loads(file.read_text())
-            versions = [KnownVersion(**known) for known in document.pop("versions")]
-            state = State(versions=versions, dropped=Counter(document.pop("dropped")), **document)
-        except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
-            raise UsageError(f"{file} cannot be read ({error!r}): give a new --out") from None
+            state = STATE.validate_json(file.read_bytes())
+        except (OSError, ValidationError) as error:
+            reason = first_fault(error) if isinstance(error, ValidationError) else str(error)
+            raise UsageError(f"{file} cannot be read ({reason}): give a new --out") from None
         changed = next((name for name in terms if state.terms.get(name) != terms[name]), None)
         if changed is not None:
             raise UsageError(

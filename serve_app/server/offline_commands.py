@@ -42,7 +42,7 @@ class OfflineCommands:
         return asyncio.run(self._listing())
 
     async def _listing(self) -> dict[str, Any]:
-        plan = await PlanWriter(self._loader, self._files).newest()
+        plan = await self._files.call(self._files.newest)
         listing = await self._loader.look()
         digests, errors = listing.digests, listing.wrong
         if plan is None and not digests:

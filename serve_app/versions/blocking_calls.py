@@ -8,11 +8,11 @@ file system returns, or with the process. Their number is limited.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from functools import partial
 from typing import Any, TypeVar
 
@@ -30,59 +30,46 @@ class BlockingCalls:
     """Runs functions in threads that can be given up."""
 
     def __init__(self, limit: int = LIMIT) -> None:
-        self._limit = limit
-        self._free = asyncio.Semaphore(limit)
+        self._free = threading.Semaphore(limit)
 
     async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None, what: str) -> Result:
-        """Return what the function returns; raise what it raises, and UnavailableError when it takes too long.
+        """Return what the function returns, as `wait` does."""
+        return await self.wait(self.start(function, *arguments, timeout_s=timeout_s), timeout_s=timeout_s, what=what)
+
+    def start(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None = None) -> Future[Result]:
+        """Call a function when a thread is free, which may take `timeout_s`; then it goes on whoever waits for it."""
+        outcome: Future[Result] = Future()
+        outcome.set_running_or_notify_cancel()  # it cannot be cancelled
+
+        def call() -> None:
+            if not self._free.acquire(timeout=timeout_s):
+                return  # those who wait have given up
+            try:
+                settle: Callable[[], None] = partial(outcome.set_result, function(*arguments))
+            except BaseException as error:
+                settle = partial(outcome.set_exception, error)
+            self._free.release()
+            settle()
+
+        # A daemon thread, so that the process can end while it is stuck.
+        threading.Thread(target=call, name="policies", daemon=True).start()
+        return outcome
+
+    async def wait(self, outcome: Future[Result], *, timeout_s: float | None, what: str) -> Result:
+        """Return a call's result; raise what it raises, and UnavailableError when it takes too long.
 
         `what` names the activity in the error. A `timeout_s` of None waits for as long as it takes.
         """
         began = time.monotonic()
+        returned = asyncio.wrap_future(outcome)
         try:
-            await asyncio.wait_for(self._free.acquire(), timeout_s)
-        except asyncio.TimeoutError:  # which is Python's own from 3.11 on
-            raise UnavailableError(
-                f"{what} could not start within {timeout_s:g} s: {self._limit} earlier calls have not come back "
-                "from the file system"
-            ) from None
-        returned = self._start(function, arguments)
-        try:
-            done: set[asyncio.Future[Result]] = set()
-            while not done and (timeout_s is None or time.monotonic() - began < timeout_s):
+            while timeout_s is None or time.monotonic() - began < timeout_s:
                 left_s = SILENCE_S if timeout_s is None else timeout_s - (time.monotonic() - began)
                 done, _ = await asyncio.wait([returned], timeout=min(SILENCE_S, left_s))
-                if not done and left_s >= SILENCE_S:
+                if done:
+                    return returned.result()
+                if left_s >= SILENCE_S:
                     logger.warning("waiting for %s (%.0f s)", what, time.monotonic() - began)
         finally:
             returned.cancel()  # if it has not returned, its result is no longer wanted
-        if not done:
-            raise UnavailableError(
-                f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?"
-            )
-        return returned.result()
-
-    def _start(self, function: Callable[..., Result], arguments: tuple[Any, ...]) -> asyncio.Future[Result]:
-        loop = asyncio.get_running_loop()
-        returned: asyncio.Future[Result] = loop.create_future()
-
-        def call() -> None:
-            settle: Callable[[], None]
-            try:
-                settle = partial(returned.set_result, function(*arguments))
-            except BaseException as error:
-                settle = partial(returned.set_exception, error)
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(finish, settle)
-
-        def finish(settle: Callable[[], None]) -> None:
-            self._free.release()
-            if not returned.cancelled():
-                settle()
-
-        try:  # a daemon thread, so that the process can end while it is stuck
-            threading.Thread(target=call, name="policies", daemon=True).start()
-        except RuntimeError:  # there are too many in this process
-            self._free.release()
-            raise
-        return returned
+        raise UnavailableError(f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?")

@@ -42,11 +42,12 @@ class Command(BaseModel):
     model_config = ConfigDict(extra="forbid")
     verb: ClassVar[str]
     summary: ClassVar[str]
+    nothing: ClassVar[str] = ""  # the word for a command without values
 
     @property
     def words(self) -> str:
-        """What follows the command and the policy's name on the command line."""
-        return ""
+        """The command's values, for the plan and the logs."""
+        return " ".join(str(value) for _, value in self if value is not None) or self.nothing
 
     def line(self, name: str) -> str:
         """Return the command in a line, for the plan and the logs."""
@@ -71,10 +72,6 @@ class Load(Command):
     summary = "Load a version, prove it, and keep it ready: not in use until an alias points to it"
     version: Version | None = Field(default=None, description="The repository's newest by default.")
     _digest: str = PrivateAttr("")
-
-    @property
-    def words(self) -> str:
-        return self.version or "newest"
 
     @classmethod
     def of(cls, version: str, digest: str) -> Self:
@@ -101,10 +98,6 @@ class Unload(Command):
     verb = "unload"
     summary = "Unload a version, or the policy"
     version: Version | None = Field(default=None, description="The whole policy by default.")
-
-    @property
-    def words(self) -> str:
-        return self.version or ""
 
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
         version = self.version
@@ -185,13 +178,10 @@ class Rollback(Command):
 
 class SetCanary(Command):
     verb = "canary"
+    nothing = "off"
     summary = "Give another version a share of the sessions"
     version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
     share: float | None = Field(None, ge=0, le=1, description="Share of the sessions; 0 ends the canary.")
-
-    @property
-    def words(self) -> str:
-        return f"{self.version or 'off'} {self.share or ''}".strip()
 
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
         if self.version is not None and self.share is None:
@@ -202,12 +192,9 @@ class SetCanary(Command):
 
 class SetShadow(Command):
     verb = "shadow"
+    nothing = "off"
     summary = "Compute and compare another version's actions, without using them"
     version: Reference | None = Field(description="A loaded version or an alias; null ends the shadow.")
-
-    @property
-    def words(self) -> str:
-        return self.version or "off"
 
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
         return _changed(name, policy, shadow=self.version)

@@ -13,9 +13,9 @@ import hashlib
 import os
 import re
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -31,6 +31,7 @@ from rlservo.serve_app.repository.storage import (
     object_storage,
     place_of,
 )
+from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.serving_plan import Plan
 
 if TYPE_CHECKING:
@@ -40,9 +41,11 @@ FOLDER = ".plan"
 FOLDER_POLL_S = 0.5
 STORAGE_POLL_S = 5.0
 
+Result = TypeVar("Result")
+
 
 class PlanFiles:
-    """The plans of the processes that serve the same places. Everything here blocks."""
+    """The plans of the processes that serve the same places. All but `call` blocks."""
 
     def __init__(
         self,
@@ -59,7 +62,8 @@ class PlanFiles:
         self._places = [place_of(place) for place in places]
         self._root = None if root is None else place_of(root)
         self._cache = cache
-        self.timeout_s = timeout_s
+        self._timeout_s = timeout_s
+        self._calls = BlockingCalls()
 
     @property
     def place(self) -> str:
@@ -70,6 +74,11 @@ class PlanFiles:
     def poll_s(self) -> float:
         """[s] between looks for a new plan."""
         return FOLDER_POLL_S if self._copy is None else STORAGE_POLL_S
+
+    async def call(self, method: Callable[..., Result], *arguments: Any) -> Result:
+        """Call a method below. Raises what it raises, and UnavailableError when it takes too long."""
+        what = "reading or writing the plan of what is served"
+        return await self._calls.run(method, *arguments, timeout_s=self._timeout_s, what=what)
 
     def newest(self) -> Plan | None:
         """Return the newest plan, if there is one. Raises UnavailableError."""
@@ -101,7 +110,7 @@ class PlanFiles:
     @functools.cached_property
     def _storage(self) -> ObjectStorage | FolderStorage:
         root = self._root or _first_writable(self._places)
-        return object_storage(root, self.timeout_s) if is_uri(root) else FolderStorage(Path(root))
+        return object_storage(root, self._timeout_s) if is_uri(root) else FolderStorage(Path(root))
 
     @functools.cached_property
     def _copy(self) -> Path | None:

@@ -78,7 +78,6 @@ class PlanFollower:
                 plan.changed_by,
             )
         await self._apply(plan)
-        self._loader.proven = ()
 
     async def give(self, command: Command, name: str, *, by: str = "") -> Plan:
         """Carry out a command as `PlanWriter.give` does; return the plan when this process serves it."""
@@ -89,9 +88,7 @@ class PlanFollower:
             refused = error.details.get("versions", ())
             self._refused = {(each["name"], each["version"]): each["reason"] for each in refused}
             raise
-        self._try_again()
         await self._apply(plan)
-        self._loader.proven = ()  # the store holds those of them that are served
         return plan
 
     def _generation(self) -> int:
@@ -101,16 +98,12 @@ class PlanFollower:
 
     async def follow(self) -> None:
         """Serve the newest plan if another one is served, and try again what could not be loaded a while ago."""
-        plan = await self._writer.after(self._generation())
-        if self._failed and time.monotonic() - self._tried_at > RETRY_PERIOD_S and self._try_again():
+        plan = await self._files.call(self._files.after, self._generation())
+        can_try_again = any(key[:2] not in self._loader.loading for key in self._failed)
+        if can_try_again and time.monotonic() - self._tried_at > RETRY_PERIOD_S:
             plan = plan or self.plan
         if plan is not None:
             await self._apply(plan)
-
-    def _try_again(self) -> bool:
-        """Forget what could not be loaded, except versions that are still loading: a file system may hang."""
-        before, self._failed = self._failed, {k: e for k, e in self._failed.items() if k[:2] in self._loader.loading}
-        return self._failed != before
 
     async def poll_plan(self) -> None:
         """Follow the plans that others write, until cancelled."""
@@ -188,13 +181,14 @@ class PlanFollower:
 
         Raises BundleError if this process serves nothing yet and a default version cannot be loaded.
         """
-        self._tried_at = time.monotonic()
+        self._tried_at, loading = time.monotonic(), self._loader.loading
         found: dict[Loadable, Policy | RlservoError] = {}
         for name, wanted in plan.policies.items():
             for version, digest in wanted.versions.items():
                 key = (name, version, digest)
-                try:
-                    found[key] = self._failed.get(key) or await self._loader.load(*key)
+                try:  # a version that is still loading is not waited for again: a file system may hang
+                    hanging = self._failed.get(key) if key[:2] in loading else None
+                    found[key] = hanging or await self._loader.load(*key)
                 except RlservoError as error:
                     found[key] = error
         self._arrange(plan, found)
@@ -205,7 +199,7 @@ class PlanFollower:
         if self.plan is not None and plan.generation < self.plan.generation:
             return  # a later plan has been served while this one was loading
         serving: dict[str, PolicyPlan] = {}
-        kept: list[Policy] = []
+        kept: dict[Loadable, Policy] = {}
         for name, wanted in plan.policies.items():
             keys = [(name, version, digest) for version, digest in wanted.versions.items()]
             errors = {key[1]: error for key in keys if isinstance(error := found[key], RlservoError)}
@@ -221,11 +215,15 @@ class PlanFollower:
                     f"{plan.generation} of {self._files.place}: {errors[wanted.default].message}"
                 )
             serving[name] = wanted
-            kept += [policy for key in keys if (policy := self._loader.get(*key)) is not None]
-        for policy in kept:
+            for key in keys:
+                policy = found.get(key) or self._loader.get(*key)
+                if policy is not None and not isinstance(policy, RlservoError):
+                    kept[key] = policy
+        self._loader.keep(kept)
+        for policy in kept.values():
             self._served.setdefault(policy.contract.name, set()).add(policy.identity)
         changed = [name for name, identities in self._served.items() if len(identities) > 1]
-        self.store = PolicyStore(kept, serving, changed=changed)
+        self.store = PolicyStore(kept.values(), serving, changed=changed)
         self.plan = plan
         self._failed = {key: each for key, each in found.items() if isinstance(each, RlservoError)}
         if self._failed:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from typing import TypeVar
 
 from rlservo.export.contract.errors import (
     BundleError,
@@ -14,7 +12,6 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.plan_commands import Command, Load, differences, first_policies
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.serving_plan import Plan, ServedConfig, now
@@ -25,24 +22,13 @@ logger = logging.getLogger(__name__)
 ATTEMPTS = 10  # at a number, while others change something else
 REFUSALS = (BundleError, RefusedError, UsageError)  # of the repository, of the proof
 
-Result = TypeVar("Result")
-
 
 class PlanWriter:
-    """Reads and writes the plan of a repository."""
+    """Writes the plan of a repository."""
 
     def __init__(self, loader: VersionLoader, files: PlanFiles) -> None:
         self._loader = loader
         self._files = files
-        self._calls = BlockingCalls()
-
-    async def newest(self) -> Plan | None:
-        """Return the newest plan, if there is one. Raises UnavailableError."""
-        return await self._run(self._files.newest)
-
-    async def after(self, number: int) -> Plan | None:
-        """Return the newest plan that has followed one; None if none has. Raises UnavailableError."""
-        return await self._run(lambda: self._files.after(number))
 
     async def at_start(self, config: ServedConfig) -> Plan:
         """Return the newest plan; if there is none, prove and write the one that a configuration means.
@@ -51,9 +37,9 @@ class PlanWriter:
         BundleError and UnavailableError.
         """
         try:
-            plan = await self.newest()
+            plan = await self._files.call(self._files.newest)
         except UnavailableError as error:
-            plan = await self._run(self._files.remembered)
+            plan = await self._files.call(self._files.remembered)
             if plan is None:
                 raise
             logger.warning("%s: serving plan %d, the last one that was seen here", error.message, plan.generation)
@@ -72,11 +58,11 @@ class PlanWriter:
         RefusedError if a version cannot be served, UnavailableError if something could not be read or written, and
         ConflictError if another command changed the same alias, version, canary or shadow at the same time.
         """
-        by = by or command.line(name)
         try:
             if isinstance(command, Load):
                 command = Load.of(*(await self._loader.look()).find(name, command.version))
-            before = await self.newest()
+            by = by or command.line(name)
+            before = await self._files.call(self._files.newest)
             if (before.generation if before is not None else 0) < known:
                 raise UnavailableError(f"{self._files.place} has lost plan {known}, which is served here")
             return await self._write(before or await self._unwritten(ServedConfig()), command, name, by)
@@ -92,7 +78,7 @@ class PlanWriter:
             await self._loader.prove(policies, before.policies if before.generation else {})
             plan = before.after(policies, by)
             try:
-                if await self._run(lambda plan=plan: self._files.create(plan), "writing"):  # type: ignore[misc]
+                if await self._files.call(self._files.create, plan):
                     return plan
             except UnavailableError as error:
                 if before.generation:
@@ -101,7 +87,7 @@ class PlanWriter:
                     f"{error.message}: the first plan could not be written; RLSERVO_PLAN names another place for it, "
                     "and `rlservo policy load NAME --repository PLACE` writes it for servers that only read"
                 ) from None
-            first = await self.newest()
+            first = await self._files.call(self._files.newest)
             if first is None:
                 raise UnavailableError(f"{self._files.place} has lost the plan that was just there")
             ours, theirs = differences(before.policies, policies), differences(before.policies, first.policies)
@@ -119,10 +105,6 @@ class PlanWriter:
         """Return the plan before the first, which is not written."""
         policies = first_policies(config, (await self._loader.look()).available(needs_all=config.wants_all))
         return Plan(generation=0, policies=policies, changed_at=now(), changed_by="configuration")
-
-    async def _run(self, function: Callable[[], Result], doing: str = "reading") -> Result:
-        what = f"{doing} the plan of what is served"
-        return await self._calls.run(function, timeout_s=self._files.timeout_s, what=what)
 
 
 def _refused(error: RlservoError) -> RefusedError:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import weakref
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future
 from typing import Any, TypeVar
 
 from rlservo.export.contract.contract import Contract
@@ -51,19 +50,22 @@ class VersionLoader:
         self._options = options or {}
         self._timeout_s = timeout_s
         self._calls = BlockingCalls()
-        self.proven: Sequence[Policy] = ()
-        """Loaded for the last proof, and kept in memory until the caller or the next proof replaces them."""
-        self._loaded: weakref.WeakValueDictionary[Loadable, Policy] = weakref.WeakValueDictionary()
-        self._tasks: dict[Loadable, asyncio.Task[Policy]] = {}
+        self._loads: dict[Loadable, Future[Policy]] = {}
+        """Loaded versions, and those that are being loaded or could not be."""
 
     @property
     def loading(self) -> set[Key]:
         """Name and version of what is being loaded."""
-        return {(name, version) for (name, version, _), task in self._tasks.items() if not task.done()}
+        return {(name, version) for (name, version, _), load in self._loads.items() if not load.done()}
 
     def get(self, name: str, version: str, digest: str) -> Policy | None:
         """Return the policy if the bundle with that hash is in memory."""
-        return self._loaded.get((name, version, digest))
+        load = self._loads.get((name, version, digest))
+        return None if load is None or not load.done() or load.exception() else load.result()
+
+    def keep(self, served: Collection[Loadable]) -> None:
+        """Forget the versions in memory that are not served, such as those that were proven for a refused command."""
+        self._loads = {key: load for key, load in self._loads.items() if key in served or not load.done()}
 
     async def look(self) -> Listing:
         """Return what the repository holds now. Raises UnavailableError when that takes too long."""
@@ -81,22 +83,11 @@ class VersionLoader:
         continues then, and the next call may find it done.
         """
         key = (name, version, digest)
-        policy = self._loaded.get(key)
-        if policy is not None:
-            return policy
-        task = self._tasks.get(key)
-        if task is None:  # other callers meanwhile wait for the same task
-            what = f"loading policy '{name}' version {version}"
-            task = asyncio.create_task(self._calls.run(self._load_accepted, *key, timeout_s=None, what=what))
-            self._tasks[key] = task
-        done, _ = await asyncio.wait([task], timeout=self._timeout_s)
-        if not done:
-            raise UnavailableError(
-                f"loading policy '{name}' version {version} took longer than {self._timeout_s:g} s and was given "
-                "up: does the file system hang?"
-            )
-        self._tasks.pop(key, None)
-        return task.result()
+        load = self._loads.get(key)  # other callers meanwhile wait for the same one
+        if load is None or (load.done() and load.exception()):
+            load = self._loads[key] = self._calls.start(self._load_accepted, *key)
+        what = f"loading policy '{name}' version {version}"
+        return await self._calls.wait(load, timeout_s=self._timeout_s, what=what)
 
     async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
         """Load new versions of `policies` and those with an alias; check that canary and shadow fit the default one.
@@ -104,7 +95,6 @@ class VersionLoader:
         Raises RefusedError with every version that cannot be served, and UnavailableError if it only could not be read,
         or not in time.
         """
-        held: list[Policy] = []
         failures: list[tuple[Key, RlservoError]] = []
         for name, policy in policies.items():
             was = before.get(name)
@@ -115,11 +105,11 @@ class VersionLoader:
             for version, digest in policy.versions.items():
                 if known.get(version) != digest or version in relied_on:
                     try:
-                        held.append(await self.load(name, version, digest))
+                        await self.load(name, version, digest)
                     except RlservoError as error:
                         failures.append(((name, version), error))
             if not failures:
-                held += await self._check_companions(name, policy)
+                await self._check_companions(name, policy)
         if failures:
             details = {"versions": [{"name": n, "version": v, "reason": e.message} for (n, v), e in failures]}
             try:
@@ -128,7 +118,6 @@ class VersionLoader:
                 raise UnavailableError(error.message, details) from None
             except RlservoError as error:
                 raise RefusedError(error.message, details) from None
-        self.proven = held
 
     async def _look(self, function: Callable[..., Result], *arguments: Any) -> Result:
         what = "looking through the policies' folders"
@@ -150,18 +139,16 @@ class VersionLoader:
                     f"{folder} is not the bundle that was accepted as version {version} of '{name}': export changes "
                     "under a new version, or load this one again"
                 )
-        self._loaded[name, version, digest] = policy
         return policy
 
-    async def _check_companions(self, name: str, policy: PolicyPlan) -> list[Policy]:
+    async def _check_companions(self, name: str, policy: PolicyPlan) -> None:
         """Refuse a canary or shadow whose observations or actions differ from the default version's."""
-        held: list[Policy] = []
         for role in ("canary", "shadow"):
             version = policy.version_of(policy.uses.get(f"the {role}", ""))
             if version is None or policy.default is None:
                 continue
-            held += [await self.load(name, each, policy.versions[each]) for each in (version, policy.default)]
-            theirs, ours = held[-2].contract, held[-1].contract
+            both = [await self.load(name, each, policy.versions[each]) for each in (version, policy.default)]
+            theirs, ours = (each.contract for each in both)
             if _interface(theirs) != _interface(ours):
                 raise RefusedError(
                     f"policy '{name}' version {version} cannot be the {role} of version {policy.default}: its "
@@ -176,7 +163,6 @@ class VersionLoader:
                 raise RefusedError(
                     f"policy '{name}' version {version} remembers its episode: a shadow computes on single observations"
                 )
-        return held
 
 
 def _interface(contract: Contract) -> tuple[Any, ...]:

@@ -92,7 +92,7 @@ def connection_pool(
     server = urlsplit(url)
     options["network_backend"] = backend
     # Reading the certificates takes 20 ms; http has no use for them.
-    options["ssl_context"] = certificates() if server.scheme == "https" else None
+    options["ssl_context"] = certificates() if server.scheme in ("https", "wss") else None
     is_direct = is_loopback(server.hostname or "") or proxy_bypass(server.netloc)
     proxy = None if is_direct else getproxies().get(server.scheme)
     if proxy is None:

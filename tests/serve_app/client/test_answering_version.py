@@ -110,15 +110,15 @@ def test_canary_gets_its_share_of_the_episodes_and_each_of_them_one_version(arms
 def test_a_version_that_another_process_does_not_serve_yet_is_asked_for_again(
     arms: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fetch = PolicyClient._fetch_version
+    fetch = PolicyClient._fetch_contract
     unknown = [UnknownVersionError("policy 'ur5' has no version '2'")] * 2
 
-    def fetch_late(client: PolicyClient, version: str, deadline: float) -> Any:
-        if unknown:
+    def fetch_late(client: PolicyClient, version: str | None, timeout_s: float | None) -> Any:
+        if unknown and version == "2":
             raise unknown.pop()
-        return fetch(client, version, deadline)
+        return fetch(client, version, timeout_s)
 
-    monkeypatch.setattr(PolicyClient, "_fetch_version", fetch_late)
+    monkeypatch.setattr(PolicyClient, "_fetch_contract", fetch_late)
     with PolicyClient(arms.url, "ur5") as client:
         assert np.array_equal(client.act(OBS), arms.action("1"))
         arms.move("2")
@@ -168,6 +168,22 @@ def test_stateless_loop_follows_production_at_once(arms: Server, kind: Kind) -> 
                 assert np.array_equal(client.act(OBS), arms.action(production))
                 assert client.contract.version == production
                 assert np.array_equal(fixed.act(OBS), arms.action("1"))
+
+
+@CLIENTS
+def test_an_alias_is_looked_up_at_each_reset(arms: Server, kind: Kind) -> None:
+    with kind(arms.url, "ur5", version=PRODUCTION, deadline_ms=20_000) as client:
+        for before, production in ("11", "12", "21"):
+            arms.move(production)
+            assert np.array_equal(client.act(OBS), arms.action(before))  # the episode stays with its version
+            client.reset()
+            assert np.array_equal(client.act(OBS), arms.action(production))
+
+
+def test_a_stream_without_a_name_gets_the_servers_default_policy(arms: Server) -> None:
+    with StreamClient(arms.url) as client:
+        assert client.contract.name == "ur5" and np.array_equal(client.act(OBS), arms.action("1"))
+        assert client.reconnects == 0
 
 
 @CLIENTS
@@ -224,7 +240,7 @@ def test_action_of_a_version_with_other_spaces_is_never_used(
         first = client.act(OBS)
         server.move("2")
         with pytest.raises(
-            UnavailableError, match="version 2 of policy 'ur5' answers now, and its action space differs"
+            UnavailableError, match=r"version 2 of policy 'ur5' answers now, and differs from version 1, .* in action"
         ):
             client.act(OBS)
         held = WithFallback(client, [0.25] * 6)

@@ -40,14 +40,14 @@ def known(episode: Episode) -> KnownVersion:
 def test_a_whole_explored_episode_of_a_known_version_is_admitted(ur5: Path, tmp_path: Path) -> None:
     episode = recorded(ur5, tmp_path / "run.mcap")
     admission = Admission("ur5", max_age=1)
-    admitted = admission.judge(episode, [known(episode), OLD])
+    (admitted,) = admission.judge(episode, [known(episode), OLD])
     assert isinstance(admitted, Admitted)
     assert admitted.age == 1 and admitted.version == known(episode) and admitted.rewards.tolist() == [0.5] * 4
-    assert admission.judge(episode, [known(episode), OLD, OLD]) == "of a version that is too old"
-    assert admission.judge(episode, [OLD]) == "of a version that this run did not make"
+    assert admission.judge(episode, [known(episode), OLD, OLD]) == ["of a version that is too old"]
+    assert admission.judge(episode, [OLD]) == ["of a version that this run did not make"]
     foreign = KnownVersion(known(episode).version, "0" * 64, known(episode).contract_sha256)
-    assert admission.judge(episode, [foreign]) == "whose graph or contract is not the version's"
-    assert Admission("another", max_age=1).judge(episode, [known(episode)]) is None
+    assert admission.judge(episode, [foreign]) == ["whose graph or contract is not the version's"]
+    assert Admission("another", max_age=1).judge(episode, [known(episode)]) == []
 
 
 def acted(explore: list[bool], rewards: list[float], *, final: bool = True) -> Callable[[WithRecording], None]:
@@ -81,7 +81,7 @@ def test_what_a_robot_did_otherwise_is_dropped(
     ur5: Path, tmp_path: Path, play: Callable[[WithRecording], None], reason: str
 ) -> None:
     episode = recorded(ur5, tmp_path / "run.mcap", play)
-    assert Admission("ur5", max_age=1).judge(episode, [known(episode)]) == reason
+    assert Admission("ur5", max_age=1).judge(episode, [known(episode)]) == [reason]
 
 
 def change_logp(decision: dict[str, Any]) -> None:
@@ -119,13 +119,13 @@ def test_a_forged_decision_is_dropped_with_its_episode(
 ) -> None:
     episode = recorded(ur5, tmp_path / "run.mcap")
     forge(episode._decisions[3])
-    assert Admission("ur5", max_age=0).judge(episode, [known(episode)]) == reason
+    assert Admission("ur5", max_age=0).judge(episode, [known(episode)]) == [reason]
 
 
 def test_a_reward_function_stands_in_for_what_clients_say(ur5: Path, tmp_path: Path) -> None:
     episode = recorded(ur5, tmp_path / "run.mcap", acted([True, True], [float("nan")] * 2))
     reward = reward_of("def reward(obs, action, next_obs):\n    return float(next_obs[0] - obs[1])\n", "r.py")
-    admitted = Admission("ur5", max_age=0, reward=reward).judge(episode, [known(episode)])
+    (admitted,) = Admission("ur5", max_age=0, reward=reward).judge(episode, [known(episode)])
     assert isinstance(admitted, Admitted)
     assert admitted.rewards == pytest.approx([OBS[0] - OBS[1]] * 2)
     fails = reward_of("def reward(obs, action, next_obs):\n    return obs['x']\n", "r.py")
@@ -146,19 +146,17 @@ def test_a_reward_function_may_say_where_episodes_end(ur5: Path, tmp_path: Path)
     episode = recorded(ur5, tmp_path / "run.mcap", silent)
     source = "def reward(obs, action, next_obs):\n    return float(next_obs[0]), bool(next_obs[0] > 0.25)\n"
     admission = Admission("ur5", max_age=0, reward=reward_of(source, "r.py"))
-    parts = admission.parts(episode)
-    assert [(len(part), part.terminated) for part in parts] == [(3, True), (1, True), (1, True)]
-    assert Admission("ur5", max_age=0).parts(episode) == [episode]
-    judged = [admission.judge(part, [known(episode)]) for part in parts]
-    assert [one.rewards.tolist() for one in judged if isinstance(one, Admitted)] == [
+    parts = [one for one in admission.judge(episode, [known(episode)]) if isinstance(one, Admitted)]
+    assert [(len(part.episode), part.episode.terminated) for part in parts] == [(3, True), (1, True), (1, True)]
+    assert [part.rewards.tolist() for part in parts] == [
         pytest.approx([0.1, 0.2, 0.3]), pytest.approx([0.4]), pytest.approx([0.5]),
     ]  # fmt: skip
+    assert Admission("ur5", max_age=0).judge(episode, [known(episode)]) == ["without an end"]
     # Without an end anywhere the last decision is only the observation after the one before.
     never = Admission("ur5", max_age=0, reward=reward_of("def reward(o, a, n):\n    return 1.0\n", "r.py"))
-    (whole,) = never.parts(episode)
-    admitted = never.judge(whole, [known(episode)])
-    assert isinstance(admitted, Admitted) and whole.truncated and admitted.rewards.tolist() == [1.0] * 5
-    assert whole.final_obs is not None and whole.final_obs["obs"][0, 0] == pytest.approx(0.5)
+    (whole,) = never.judge(episode, [known(episode)])
+    assert isinstance(whole, Admitted) and whole.episode.truncated and whole.rewards.tolist() == [1.0] * 5
+    assert whole.episode.final_obs is not None and whole.episode.final_obs["obs"][0, 0] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("name", ["no_such_module:reward", "math:no_such_function", "math:pi"])

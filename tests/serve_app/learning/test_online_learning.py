@@ -28,11 +28,12 @@ from rlservo.export.contract.errors import ConflictError, UsageError
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint, silent
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.serve_app.client.promotion import Terms
 from rlservo.serve_app.client.promotion_evidence import Limits
 from rlservo.serve_app.learning.admission import Admission
 from rlservo.serve_app.learning.following import FollowedRecordings, ServerRecordings
 from rlservo.serve_app.learning.online import OnlineLearning
-from rlservo.serve_app.learning.release import Canary, Release, Target
+from rlservo.serve_app.learning.release import Release, Target
 from rlservo.serve_app.learning.rllib_episodes import single_agent_episode
 from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 from rlservo.serve_app.learning.run_folder import RunFolder
@@ -88,7 +89,7 @@ class Cell:
         run: RunFolder,
         learner: OnlineLearner | None = None,
         *,
-        canary: Canary | None = None,
+        canary: Terms | None = None,
         follow: bool = False,
         **more: Any,
     ) -> OnlineLearning:
@@ -96,7 +97,7 @@ class Cell:
         learner = learner or OnlineLearner(self.checkpoint, batch_size=BATCH)
         folders = [] if follow else [self.folder / "recorded"]
         servers = [ServerRecordings(self.admin, run.path / "followed")] if follow else []
-        release = Release(target, run, self.admin, url=self.url, app_dir=self.folder, progress=str)
+        release = Release(target, run, self.admin, app_dir=self.folder, progress=str)
         return OnlineLearning(
             learner, run, FollowedRecordings(folders, self.said.append, servers),
             Admission("policy", max_age=learner.max_age, reward=release.named_reward()), release,
@@ -287,7 +288,7 @@ def test_a_version_goes_to_production_by_its_canary_or_learning_goes_on(cell: Ce
     robot.start()
     try:
         with cell.run_folder() as run:
-            canary = Canary(1.0, 3.0, limits, every_s=0.2)
+            canary = Terms((cell.url,), "policy", "", 1.0, 3.0, limits)
             cell.learning(run, canary=canary, sleep=time.sleep).run(versions=1)
             assert [known.version for known in run.state.versions] == ["2", "3"]
             assert cell.aliases() == {"production": "3"}
