@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -138,8 +138,9 @@ def show(line: str) -> None:
 
 
 def note(line: str) -> None:
-    """Print a line that a program reading our output should not see."""
-    print(line.translate(ESCAPES), file=sys.stderr, flush=True)
+    """Print a line that a program reading our output should not see, unless the terminal is gone."""
+    with suppress(OSError):
+        print(line.translate(ESCAPES), file=sys.stderr, flush=True)
 
 
 def show_command(words: Sequence[str]) -> None:

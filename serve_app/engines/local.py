@@ -312,6 +312,15 @@ class _Supervisor(Multiprocess):
         self._on_stop = on_stop
         self.is_asked_to_stop = False
 
+    def run(self) -> None:
+        """Supervise the workers until they are stopped, or a callback raises."""
+        try:
+            super().run()
+        except BaseException:
+            self.terminate_all()  # Python's exit would wait for them
+            self.join_all()
+            raise
+
     def keep_subprocess_alive(self) -> None:
         """Replace workers that died or hang; report once when all are ready."""
         super().keep_subprocess_alive()
