@@ -20,6 +20,7 @@ import pytest
 
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import HEEDING_CTRL_C
 from stores import load_store
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,9 +38,13 @@ class Process:
         self.lines: list[str] = []
         self._rest = b""
         self.process = subprocess.Popen(
-            [str(PYTHON), *words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            env=os.environ | environment, start_new_session=True,
-        )  # fmt: skip
+            [*HEEDING_CTRL_C, str(PYTHON), *words],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            env=os.environ | environment,
+            start_new_session=True,
+        )
         assert self.process.stdout is not None
         self._selector = selectors.DefaultSelector()
         self._selector.register(self.process.stdout, selectors.EVENT_READ)

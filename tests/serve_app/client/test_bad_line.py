@@ -372,8 +372,11 @@ def test_a_server_that_is_away_is_unavailable_and_found_again(
 
 
 def test_a_stream_is_refused_in_the_servers_own_words(line: FaultyLine) -> None:
-    with pytest.raises(UnknownPolicyError, match="no policy 'nobody' is loaded"):
-        _ = StreamClient(line.url, "nobody", api_key=KEY).contract
+    with (
+        StreamClient(line.url, "nobody", api_key=KEY) as client,
+        pytest.raises(UnknownPolicyError, match="no policy 'nobody' is loaded"),
+    ):
+        _ = client.contract
     with pytest.raises(UsageError, match="is not a server address"):
         StreamClient("127.0.0.1:8000")
     with StreamClient(line.url, "ur5") as client, pytest.raises(Exception, match="requires an API key") as caught:

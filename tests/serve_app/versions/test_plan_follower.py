@@ -105,7 +105,7 @@ def test_a_change_is_served_by_who_took_it_when_it_answers_and_by_the_others_wit
         await until(lambda: fleet.defaults() == ["2", "2", "2"])
         assert asyncio.get_running_loop().time() - began < 1.5  # on a busy machine
         assert held is not None and held.default("ur5") == "1"  # a request that began with the old store ends with it
-        held.act("ur5", None, OBS)
+        held.get("ur5").act(OBS)
         assert fleet.numbers() == {3}
         for poll in polls:
             poll.cancel()
@@ -308,7 +308,7 @@ def test_the_same_version_is_the_same_bundle_in_every_process(
         assert "is not the bundle that was accepted" in restarted.states()["ur5"]["2"].reason
         await fleet.controls[0].give(Load(version="2"), "ur5")  # now it is
         reloaded = fleet.controls[0].store
-        assert reloaded is not None and not np.allclose(reloaded.act("ur5", "2", OBS).action, action)
+        assert reloaded is not None and not np.allclose(reloaded.get("ur5", "2").act(OBS), action)
 
     asyncio.run(run())
 
