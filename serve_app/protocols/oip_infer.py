@@ -44,6 +44,7 @@ LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensor
 BINARY = b"application/octet-stream"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
 LAST_ACTION = "last_action"  # inputs named like the outputs `action` and `action.<path>`
+MOST_DIMENSIONS = 32
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits into one packet anyway
 COMPRESSION_LEVEL = 1  # a robot's numbers hardly compress, and a control loop waits for them
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
@@ -54,7 +55,7 @@ class Tensor(TypedDict, total=False):
     """A tensor, in JSON or (with the parameter `binary_data_size`) as bytes after the JSON."""
 
     name: Required[str]
-    shape: Required[list[int]]
+    shape: Required[Annotated[list[int], Field(max_length=MOST_DIMENSIONS)]]
     datatype: Required[Annotated[str, Field(description="One of " + ", ".join(DTYPES))]]
     parameters: dict[str, Any] | None
     data: Annotated[Any, Field(description="Nested or flat, in row-major order.")]

@@ -275,6 +275,7 @@ def test_the_models_name_may_be_said_again(ask: Ask) -> None:
         (request(tensor(ROW, [1, 27], "BYTES")), 400, "holds strings: send numbers"),
         (request(tensor(ROW, [-1, 27])), 400, "'shape' must be a list of sizes"),
         (request(tensor(ROW, [1, 2**62])), 400, "'shape' must be a list of sizes"),
+        (request(tensor(ROW, ["x"] * 1000)), 400, "'inputs.0.shape' must have at most 32 items"),
         (request(tensor(ROW, [1, 27], name="image")), 422, "has no input 'image': expected 'obs'"),
         (request(tensor(ROW, [1, 27]), tensor(ROW, [1, 27])), 400, "input 'obs' is given twice"),
         (request(tensor(ROW, [1, 27], parameters={"shared_memory_region": "r"})), 400, "shared memory"),

@@ -211,6 +211,7 @@ def array(**changes: Any) -> bytes:
         (pack([1]), "bad-request", "must be a map"),
         (pack({1: 2}), "bad-request", "is not msgpack"),
         (pack({"obs": OBS, "sed": 1}), "bad-request", "unknown field 'sed'"),
+        (pack({"obs": OBS} | {f"k{i}": 0 for i in range(3000)}), "bad-request", "'k6', 'k7': expected one of deadline"),
         (pack({"obs": OBS, "seed": -1}), "bad-request", "'seed' must be greater than or equal to 0"),
         (pack({"obs": OBS[:26]}), "bad-observation", "expects obs of shape (27,), got (26,)"),
         (pack({"obs": OBS * np.float32(np.nan)}), "bad-observation", "element 0 (element_0) is nan"),
