@@ -93,7 +93,7 @@ for command in (
     estimate,
 ):
     app.command()(command)
-# ROS's own arguments are nobody's options here: --ros-args and what follows.
+# ROS's own arguments (--ros-args and what follows) are not options of this command.
 app.command(context_settings={"ignore_unknown_options": True})(ros2)
 policy.command()(promote)
 app.add_typer(robot_server, name="robot-server")

@@ -1,4 +1,4 @@
-"""Observation and action elements as fields of ROS messages, for a policy whose robot is none of ours.
+"""Observation and action elements as fields of ROS messages, for a policy of a robot that is not simulated here.
 
 A place is a line of text, `TOPIC TYPE FIELD`, with ` * FACTOR` and ` + OFFSET` where a unit differs:
 `/joint_states sensor_msgs/msg/JointState position[slider_joint]`, `/imu sensor_msgs/msg/Imu angular_velocity.z * 57.3`.

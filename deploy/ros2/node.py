@@ -49,7 +49,7 @@ def real_environment(contract: Contract) -> tuple[str, dict[str, Any]] | None:
 
 
 class Wanted(str, Enum):
-    """What the services asked for last."""
+    """The last request of the services."""
 
     RUN = "run"
     HOLD = "hold"
@@ -242,7 +242,7 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
         node.counts["decisions"] += 1
         is_over = terminated or truncated
         if report := getattr(policy, "outcome", None):  # of a recording, or a server that counts
-            policy.robot = info["robot"]  # type: ignore[attr-defined]  # a recording's, nobody's else
+            policy.robot = info["robot"]  # type: ignore[attr-defined]  # only a recording has it
             report(
                 float(reward), terminated=terminated, truncated=truncated, final_status=info.get("final_status"),
                 final_obs=observation if is_over else None,

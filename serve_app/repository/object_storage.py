@@ -47,7 +47,7 @@ class Reply:
 
     @property
     def reason(self) -> str:
-        """What the storage says of its refusal, without secrets."""
+        """The reason that the storage gave for refusing, without secrets."""
         parts = re.findall(r"<(?:Code|Message)>([^<]+)</", self.refusal)
         return _hidden(": ".join(parts[:2])) or f"status {self.status}"
 

@@ -37,7 +37,7 @@ class BlockingCalls:
         return await self.wait(self.start(function, *arguments, timeout_s=timeout_s), timeout_s=timeout_s, what=what)
 
     def start(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None = None) -> Future[Result]:
-        """Call a function when a thread is free, which may take `timeout_s`; then it goes on whoever waits for it."""
+        """Call a function once a thread is free, within `timeout_s`; it runs to its end even if no caller waits."""
         outcome: Future[Result] = Future()
         outcome.set_running_or_notify_cancel()  # it cannot be cancelled
 

@@ -119,7 +119,7 @@ class PolicyPlan(_Model):
 
     @property
     def uses(self) -> dict[str, str]:
-        """What points to a version, in words, and the version or alias that it names."""
+        """Version or alias by its use, in words, such as "the alias 'production'"."""
         uses = {f"the alias '{alias}'": version for alias, version in self.aliases.items()}
         if self.canary is not None:
             uses["the canary"] = self.canary.version
