@@ -15,7 +15,7 @@ from rlservo.serve_app.wire.asgi import ASGIApp
 
 GET, POST = "GET", "POST"
 WEBSOCKET = "WebSocket:"  # not a method that a client can send: those have no colon
-PATHS_REMEMBERED = 1024
+PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and a version can make is 170
 PARAMETER = re.compile(r"\\{(\w+)\\}")  # in an escaped path
 
 
@@ -86,7 +86,10 @@ class RoutingTable:
         """
         if method == "HEAD":  # the engine leaves out its reply's body
             method = GET
-        return self._find(method, path, method == GET and b"text/html" in accept.lower() and b"json" not in accept)
+        wants_page = method == GET and b"text/html" in accept.lower() and b"json" not in accept
+        # Anyone may send paths, of 16 KB each: long ones are not kept in memory.
+        look_up = self._find if len(method) + len(path) <= LONGEST_REMEMBERED else self._look_up
+        return look_up(method, path, wants_page)
 
     def _look_up(self, method: str, path: str, wants_page: bool) -> Found:
         others: list[Route] = []

@@ -12,6 +12,7 @@ import json
 import logging
 import re
 import socket
+import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -525,3 +526,15 @@ def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: 
             status, answer = wire.ask(method, path, name + b": caf\xe9", *bearer(ADMIN))
             assert (status, json.loads(answer)["code"]) == (400, "bad-request") and name in answer
             assert wire.ask(method, path, name + ": café".encode(), *bearer(ADMIN), body=OBS)[0] in (200, 404, 422)
+
+
+def test_long_paths_that_anyone_may_send_take_no_memory(server: Served) -> None:
+    table = server.app.table
+    tracemalloc.start()
+    try:
+        for number in range(500):
+            assert table.find("GET", f"/{number}".ljust(16_000, "x"), b"").route is None
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < 1_000_000, kept
