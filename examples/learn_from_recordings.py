@@ -48,7 +48,7 @@ from rlservo.export.checkpoints.location import (
 )
 from rlservo.export.rllib import private_names
 from rlservo.serve_app.learning.rllib_episodes import through_connectors
-from rlservo.serve_app.recording.conversion import gym_space
+from rlservo.serve_app.recording.conversion.common import gym_space
 from rlservo.serve_app.recording.reader import Recording
 
 assert ray_settings

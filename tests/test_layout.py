@@ -84,11 +84,11 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "mcap": (
         "serve_app/recording/log_file.py", "serve_app/recording/reader.py", "serve_app/recording/repair.py",
     ),
-    "pyarrow": ("serve_app/recording/parquet_export.py", "serve_app/recording/lerobot_export.py", "export/"),
+    "pyarrow": ("serve_app/recording/conversion/parquet.py", "serve_app/recording/conversion/lerobot.py", "export/"),
     "fsspec": ("export/checkpoints/remote.py",),
     "botocore": ("serve_app/repository/object_storage.py",),
     "aiohttp": (),
-    "minari": ("serve_app/recording/minari_export.py",),
+    "minari": ("serve_app/recording/conversion/minari.py",),
     "httpx": (),
     "httpcore": (
         "serve_app/client/http_transport.py", "serve_app/repository/object_storage.py",

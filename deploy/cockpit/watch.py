@@ -15,7 +15,7 @@ from rlservo.deploy.cockpit.page import aim_cameras
 from rlservo.deploy.cockpit.readings import WINDOW, Plot, escape
 from rlservo.deploy.cockpit.scenery import Scenery
 from rlservo.deploy.cockpit.stage import Scene, Stage
-from rlservo.envs.robot_server.robot import RobotState
+from rlservo.envs.robot_server.robots.robot import RobotState
 from rlservo.envs.robot_server.state_reader import RobotServerError, StateReader, env_of, quantities, show_state
 from rlservo.export.contract.errors import UnavailableError
 

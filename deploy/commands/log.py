@@ -63,9 +63,9 @@ def export(
     Example: `rlservo log export run.mcap --to parquet --out run.parquet`
     """
     with needs_extra("record"):
-        from rlservo.serve_app.recording.lerobot_export import export_lerobot
-        from rlservo.serve_app.recording.minari_export import PATH_VARIABLE, export_minari
-        from rlservo.serve_app.recording.parquet_export import export_parquet
+        from rlservo.serve_app.recording.conversion.lerobot import export_lerobot
+        from rlservo.serve_app.recording.conversion.minari import PATH_VARIABLE, export_minari
+        from rlservo.serve_app.recording.conversion.parquet import export_parquet
         from rlservo.serve_app.recording.reader import Recording
 
     recording = Recording(files)

@@ -13,7 +13,7 @@ import grpc
 
 from rlservo.envs.robot_server.launch_line import parse_launch_line
 from rlservo.envs.robot_server.messages import SERVER_MANAGER, ManagerStatus, ServerRequest
-from rlservo.envs.robot_server.robot import CLOCKS
+from rlservo.envs.robot_server.robots.robot import CLOCKS
 from rlservo.envs.robot_server.rpc_handler import rpc_handler
 from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, arrives, bind, stop_signals
 from rlservo.envs.robot_server.server_process import ServerProcess

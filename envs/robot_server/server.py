@@ -24,7 +24,7 @@ import grpc
 
 from rlservo.envs.robot_server.clock import Clock
 from rlservo.envs.robot_server.connections import count_connections
-from rlservo.envs.robot_server.robot import Robot
+from rlservo.envs.robot_server.robots.robot import Robot
 from rlservo.envs.robot_server.service import RobotService
 from rlservo.envs.robot_server.settings import PandaSettings, Settings, URSettings, settings_from_json
 
@@ -66,14 +66,14 @@ class RobotServer:
 def make_robot(settings: Settings) -> Robot:
     """Return the robot that the settings describe. MuJoCo is imported here: a manager does without it."""
     if isinstance(settings, URSettings):
-        from rlservo.envs.robot_server.ur_robot import URRobot
+        from rlservo.envs.robot_server.robots.ur import URRobot
 
         return URRobot(settings)
     if isinstance(settings, PandaSettings):
-        from rlservo.envs.robot_server.panda_robot import PandaRobot
+        from rlservo.envs.robot_server.robots.panda import PandaRobot
 
         return PandaRobot(settings)
-    from rlservo.envs.robot_server.mir100_robot import Mir100Robot
+    from rlservo.envs.robot_server.robots.mir100 import Mir100Robot
 
     return Mir100Robot(settings)
 

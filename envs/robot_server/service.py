@@ -14,7 +14,7 @@ import grpc
 
 from rlservo.envs.robot_server.clock import Clock
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
-from rlservo.envs.robot_server.robot import Robot, RobotState
+from rlservo.envs.robot_server.robots.robot import Robot, RobotState
 from rlservo.envs.robot_server.rpc_handler import rpc_handler
 
 log = logging.getLogger("rlservo.robot_server")

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar
 
 from rlservo.envs.mir100.worlds import WORLDS as MIR100_WORLDS
-from rlservo.envs.robot_server.robot import CLOCKS
+from rlservo.envs.robot_server.robots.robot import CLOCKS
 from rlservo.envs.robots.arm import MUJOCO, host_of
 from rlservo.envs.ur.model import Table
 from rlservo.envs.ur.objects import object_model

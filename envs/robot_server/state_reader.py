@@ -13,8 +13,8 @@ from rlservo.envs.panda.arm_env import PandaArmEnv
 from rlservo.envs.panda.server_state import STATE_JOINTS
 from rlservo.envs.rendering import RenderedEnv
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, Empty, State
-from rlservo.envs.robot_server.mir100_robot import CUBES, ROBOT, STATE_LENGTH, TARGET
-from rlservo.envs.robot_server.robot import RobotState
+from rlservo.envs.robot_server.robots.mir100 import CUBES, ROBOT, STATE_LENGTH, TARGET
+from rlservo.envs.robot_server.robots.robot import RobotState
 from rlservo.envs.ur.arm_env import BASE, LIMITS, URArmEnv
 from rlservo.envs.ur.parameters import JOINTS
 

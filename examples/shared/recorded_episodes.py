@@ -23,7 +23,7 @@ from ray.rllib.utils import flatten_dict
 
 from rlservo import errors
 from rlservo.serve_app.learning.rllib_episodes import single_agent_episode, why_not_whole, why_without_reward
-from rlservo.serve_app.recording.conversion import episodes_of_one
+from rlservo.serve_app.recording.conversion.common import episodes_of_one
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.own_actions import OwnActions, modes, own_actions
 from rlservo.serve_app.recording.reader import Recording

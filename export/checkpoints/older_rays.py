@@ -1,7 +1,7 @@
 """Pickles of older Rays and other Pythons, converted to those of the Ray that restores them (2.60).
 
 Names that have moved, values whose class is gone, filters' statistics. The new API stack's own differences, which take
-RLlib to translate, are in `rllib/older_components.py`.
+RLlib to translate, are in `rllib/new_stack/older_components.py`.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ What RLlib does not have are the logarithm of some elements, the sine and cosine
 stacks images).
 
 Two are called as RLlib's own, whose work they do: a checkpoint keeps a piece's state under its class's name, so that
-what was trained with either continues with the other, and `new_connectors.py` exports both alike. Checkpoints name this
+what was trained with either continues with the other, and `new_stack` exports both alike. Checkpoints name this
 module and its classes: under other names they could not be read.
 """
 

@@ -30,7 +30,7 @@ ELSEWHERE = {
 }
 """Modules with names that RLlib needs from deferred packages, to distinguish a checkpoint from a path (ray 2.60)."""
 NEEDED = (
-    "rlservo.export.rllib.new_stack",  # and its imports from RLlib
+    "rlservo.export.rllib.new_stack.policy",  # and its imports from RLlib
     "ray.rllib.connectors.env_to_module",
     "ray.rllib.connectors.module_to_env",
     "ray.rllib.core.models.torch.encoder",

@@ -23,12 +23,12 @@ def restore(files: Files, app_dir: Path, notify: Callable[[str], None], *, value
     """
     # Imported here: a Ray without the old API stack continues reading the new one's checkpoints.
     if isinstance(files, OldStackFiles):
-        from rlservo.export.rllib.old_stack import restore_old_stack
+        from rlservo.export.rllib.old_stack.policy import restore_old_stack
 
         restored = restore_old_stack(files, app_dir, notify, value=value)
     else:
         quick_import.import_needed()
-        from rlservo.export.rllib.new_stack import restore_new_stack
+        from rlservo.export.rllib.new_stack.policy import restore_new_stack
 
         restored = restore_new_stack(files, notify, value=value)
     check_unsquashing(restored.recipe.action_space, restored.recipe.transform)

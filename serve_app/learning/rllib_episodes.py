@@ -17,7 +17,7 @@ from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.nested import build_action
 from rlservo.export.rllib import private_names
-from rlservo.export.rllib.new_connectors import PLUMBING
+from rlservo.export.rllib.new_stack.connectors import PLUMBING
 from rlservo.serve_app.recording.episodes import Columns, Episode
 
 AT_ONCE = 256  # episodes per pass of a pipeline

@@ -8,7 +8,7 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, Header, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from rlservo.serve_app.recording.conversion import new_path
+from rlservo.serve_app.recording.conversion.common import new_path
 from rlservo.serve_app.recording.log_file import CHUNK_BYTES
 from rlservo.serve_app.recording.reader import FileFacts, read_records
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rlservo.envs.panda.end_effector_positioning import EndEffectorPositioningPandaSim
-from rlservo.envs.robot_server.robot import RobotState
+from rlservo.envs.robot_server.robots.robot import RobotState
 from rlservo.envs.robot_server.settings import PandaSettings
 from rlservo.envs.robot_server.state_reader import env_of, quantities, show_state
 

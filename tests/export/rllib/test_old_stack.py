@@ -31,7 +31,7 @@ from rlservo.export.prune_checkpoint import prune_checkpoint
 from rlservo.export.recipe.recipe import ObservationFilter, Preprocess, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Loop, first_step
 from rlservo.export.recipe.samples import draw_batches
-from rlservo.export.rllib.old_models import Registration, find_registrations
+from rlservo.export.rllib.old_stack.custom_models import Registration, find_registrations
 from rlservo.export.rllib.restore import restore
 from rlservo.export.sources.restored_policy import RestoredPolicy
 from rlservo.export.verify_bundle import verify_bundle

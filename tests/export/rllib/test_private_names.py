@@ -22,7 +22,7 @@ RLLIB = ROOT / "export" / "rllib"
 
 def calls() -> Iterator[tuple[str, list[Any]]]:
     """Yield (function, constant arguments) of each call of `private_names` in export/rllib."""
-    for file in RLLIB.glob("*.py"):
+    for file in RLLIB.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Call) and ast.unparse(node.func).startswith("private_names."):
                 yield ast.unparse(node.func), [one.value for one in node.args if isinstance(one, ast.Constant)]
@@ -30,7 +30,7 @@ def calls() -> Iterator[tuple[str, list[Any]]]:
 
 def test_no_private_attribute_is_read_past_the_check() -> None:
     past: list[str] = []
-    for file in RLLIB.glob("*.py"):
+    for file in RLLIB.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.endswith("__"):
                 if ast.unparse(node.value) not in ("self", "super()"):

@@ -13,10 +13,10 @@ from mcap.reader import make_reader
 
 from command_line import rlservo_here
 from rlservo.export.contract.errors import UsageError
+from rlservo.serve_app.recording.conversion.lerobot import export_lerobot
+from rlservo.serve_app.recording.conversion.minari import PATH_VARIABLE, export_minari
+from rlservo.serve_app.recording.conversion.parquet import export_parquet
 from rlservo.serve_app.recording.episodes import episodes
-from rlservo.serve_app.recording.lerobot_export import export_lerobot
-from rlservo.serve_app.recording.minari_export import PATH_VARIABLE, export_minari
-from rlservo.serve_app.recording.parquet_export import export_parquet
 from rlservo.serve_app.recording.plot import plot_episode
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.recording.recorded_policy import WithRecording

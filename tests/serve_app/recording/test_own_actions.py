@@ -12,9 +12,9 @@ import pytest
 from rlservo.export.contract.action_transform import Transform, to_own, to_sent
 from rlservo.export.contract.contract import BakedStep
 from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, LeafSpec, MultiDiscreteSpec
+from rlservo.serve_app.recording.conversion.parquet import export_parquet
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.own_actions import modes, own_actions
-from rlservo.serve_app.recording.parquet_export import export_parquet
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.recording.recorded_policy import WithRecording
 from rlservo.serve_app.runtime.options import PolicyOptions

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import optional_package
-from rlservo.serve_app.recording.conversion import episodes_of_one, new_path
+from rlservo.serve_app.recording.conversion.common import episodes_of_one, new_path
 from rlservo.serve_app.recording.episodes import Columns, Episode
 from rlservo.serve_app.recording.reader import Recording
 

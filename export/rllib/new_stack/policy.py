@@ -1,6 +1,6 @@
 """A policy of RLlib's new API stack, restored and run as RLlib itself would.
 
-The module and both connector pipelines come from their own folders in the checkpoint; `new_connectors.py` reads off
+The module and both connector pipelines come from their own folders in the checkpoint; `connectors.py` reads off
 them what they do. `NewStackLoop` is RLlib's own pipelines around RLlib's own forward pass.
 """
 
@@ -56,9 +56,8 @@ from rlservo.export.recipe.trees import (
 from rlservo.export.rllib import private_names
 from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
-from rlservo.export.rllib.new_connectors import read_action_steps, read_observation_steps
-from rlservo.export.rllib.new_pipelines import Pipelines, find_agent_slot, own_copy, pipelines_of
-from rlservo.export.rllib.older_components import (
+from rlservo.export.rllib.new_stack.connectors import read_action_steps, read_observation_steps
+from rlservo.export.rllib.new_stack.older_components import (
     CONSTANT,
     is_older,
     lists_connectors,
@@ -66,6 +65,7 @@ from rlservo.export.rllib.older_components import (
     saved_spaces,
     set_saved_state,
 )
+from rlservo.export.rllib.new_stack.pipelines import Pipelines, find_agent_slot, own_copy, pipelines_of
 from rlservo.export.rllib.restore_order import connectors_that_rllib_restores
 from rlservo.export.rllib.supported_spaces import check_spaces
 from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights

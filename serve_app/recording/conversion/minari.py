@@ -16,7 +16,7 @@ from rlservo.export.contract.environment_id import importing_id
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import optional_package
 from rlservo.export.contract.nested import build_action
-from rlservo.serve_app.recording.conversion import episodes_of_one, gym_space, new_path
+from rlservo.serve_app.recording.conversion.common import episodes_of_one, gym_space, new_path
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.reader import Recording
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rlservo.envs.robot_server.arm_robot import ArmRobot
+from rlservo.envs.robot_server.robots.arm import ArmRobot
 from rlservo.envs.robot_server.settings import URSettings
 from rlservo.envs.robots.arm import MUJOCO
 from rlservo.envs.robots.connect import make_arm

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.envs.rendering import Camera
-from rlservo.envs.robot_server.robot import RobotState
+from rlservo.envs.robot_server.robots.robot import RobotState
 from rlservo.envs.robot_server.settings import ArmSettings
 from rlservo.envs.ur.object_paths import object_path
 from rlservo.envs.ur.parameters import cycle_of

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.export.contract.extras import optional_package
-from rlservo.serve_app.recording.conversion import episodes_of_one, new_path
+from rlservo.serve_app.recording.conversion.common import episodes_of_one, new_path
 from rlservo.serve_app.recording.episodes import Episode
 from rlservo.serve_app.recording.own_actions import own_actions
 from rlservo.serve_app.recording.reader import Recording

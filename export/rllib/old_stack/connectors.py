@@ -1,7 +1,7 @@
 """Steps of the old API stack's agent and action connectors for an observation and an action.
 
 They live in the policy's state. A piece that is not known is refused by its name, because leaving it out would change
-the policy. As in `new_connectors.py` the pieces are known by name.
+the policy. As in `new_stack/connectors.py` the pieces are known by name.
 """
 
 from __future__ import annotations

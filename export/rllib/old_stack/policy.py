@@ -42,9 +42,9 @@ from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.trees import build, named_leaves, space_leaves, tree_leaves
 from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
-from rlservo.export.rllib.old_connectors import check_connectors, read_old_steps, read_old_transform
-from rlservo.export.rllib.old_models import register_custom_parts
-from rlservo.export.rllib.older_policies import MIXTURES, update_policy_state
+from rlservo.export.rllib.old_stack.connectors import check_connectors, read_old_steps, read_old_transform
+from rlservo.export.rllib.old_stack.custom_models import register_custom_parts
+from rlservo.export.rllib.old_stack.older_policies import MIXTURES, update_policy_state
 from rlservo.export.rllib.supported_spaces import check_spaces
 from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
 

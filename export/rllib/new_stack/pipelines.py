@@ -2,7 +2,7 @@
 
 If an environment has several agents, the episode is one in which only the exported policy's agent acts: an agent's
 action depends on its own observations alone, because a module that looks at others' is refused. It imports ray.rllib,
-as new_stack.py does.
+as policy.py does.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, U
 from rlservo.export.recipe.describe import observation_step
 from rlservo.export.recipe.trees import Tree, build_like, map_tree, tree_leaves
 from rlservo.export.rllib import private_names
-from rlservo.export.rllib.new_connectors import SINGLE_AGENT, AgentSlot, read_observation_steps
+from rlservo.export.rllib.new_stack.connectors import SINGLE_AGENT, AgentSlot, read_observation_steps
 
 MAPPING = "AgentToModuleMapping"
 

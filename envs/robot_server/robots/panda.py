@@ -10,7 +10,7 @@ from rlservo.envs.panda.arm_env import PandaArmEnv
 from rlservo.envs.panda.model import HIGH, LOW
 from rlservo.envs.panda.server_state import STATE_JOINTS, state_dict, state_names
 from rlservo.envs.panda.simulation import PandaSimulation
-from rlservo.envs.robot_server.arm_robot import ArmRobot
+from rlservo.envs.robot_server.robots.arm import ArmRobot
 from rlservo.envs.robot_server.settings import PandaSettings
 from rlservo.envs.ur.parameters import cycle_of
 

@@ -13,7 +13,7 @@ import numpy as np
 from rlservo.envs.mir100.parameters import BEAM_COUNT, CYCLE_S
 from rlservo.envs.mir100.simulation import ROOM_VIEW, Mir100Simulation
 from rlservo.envs.rendering import Camera
-from rlservo.envs.robot_server.robot import RobotState
+from rlservo.envs.robot_server.robots.robot import RobotState
 from rlservo.envs.robot_server.settings import Mir100Settings
 
 STATE_LENGTH = 8 + BEAM_COUNT + 1 + 9

@@ -1,0 +1,1 @@
+"""Recordings as LeRobot, Minari and Parquet data sets."""
