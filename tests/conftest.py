@@ -15,9 +15,11 @@ from xdist.scheduler import LoadScopeScheduling
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# numpy's linear algebra waits for its threads by spinning, which is most of what it does beside other processes: to fit
-# a recording's values took fifteen times the processor time. Read when numpy is imported, in children too.
+# numpy's linear algebra and torch wait for their threads by spinning, which is most of what they do beside other
+# processes: to fit a recording's values took fifteen times the processor time, an update of a network three times.
+# Read when they are imported, in children too.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 pytest_plugins = [
     "servers",  # which others import, as the next
