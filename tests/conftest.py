@@ -15,9 +15,11 @@ from xdist.scheduler import LoadScopeScheduling
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# numpy's linear algebra waits for its threads by spinning, which is most of what it does beside other processes: to fit
-# a recording's values took fifteen times the processor time. Read when numpy is imported, in children too.
+# numpy's linear algebra and torch wait for their threads by spinning, which is most of what they do beside other
+# processes: to fit a recording's values took fifteen times the processor time, an update of a network three times.
+# Read when they are imported, in children too.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 pytest_plugins = [
     "servers",  # which others import, as the next
@@ -51,10 +53,12 @@ TOGETHER = {
     "tests/system/test_served_policies.py": "shipped server",
     "tests/system/test_both_engines.py": "cluster",
     "tests/system/test_shared_sessions.py": "cluster",
-    "tests/system/test_documents_run.py::test_guide_to_online_learning": "one Ray",
+    "tests/system/test_documents_run.py::test_guide_to_ray": "documents on Ray",
+    "tests/system/test_documents_run.py::test_readme_runs": "documents on Ray",
     "tests/benchmarks/test_training_benchmark.py": "one Ray",
     "tests/examples/test_edge_environments.py": "one Ray",
     "tests/examples/test_learn_from_recordings.py": "one Ray",
+    "tests/examples/test_shipped_policies.py::test_each_": "evaluations",
     "tests/examples/test_shipped_policies.py": "one Ray",
     "tests/examples/test_simple_trainer.py::test_ctrl_c": "one Ray",
     "tests/examples/test_simple_trainer.py::test_resumed": "one Ray",
@@ -70,10 +74,12 @@ TOGETHER = {
 # The files with slow tests follow, then the rest.
 LONGEST = (
     "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
+    "documents on Ray", "tests/envs/ros2/test_ros_arm.py", "tests/system/test_documents_run.py",
+    "tests/envs/ros2/test_ros_base.py", "tests/deploy/ros2/test_mapped_node.py",
     "tests/serve_app/repository/test_remote_repository.py", "ports of server managers",
-    "tests/deploy/cockpit/test_page.py", "tests/system/test_documents_run.py",
+    "tests/deploy/cockpit/test_page.py",
     "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
-    "tests/system/test_embedded_server.py", "sweep",
+    "tests/system/test_embedded_server.py", "sweep", "evaluations",
     "tests/export/rllib/test_new_stack.py", "several nodes",
     "tests/serve_app/client/test_bad_line.py",
     "tests/system/test_remote_repository.py",

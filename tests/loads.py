@@ -1,4 +1,4 @@
-"""Clients that send requests without a pause, and the replies they got."""
+"""Clients that send requests one after the other, and the replies they got."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Load:
     expected: Sequence[NDArray[Any]]
     """The actions that are right: one for each version that may answer."""
     api_key: str | None = None
-    pause_s: float = 0.005
+    pause_s: float = 0.02
     """After each of a client's requests [s]."""
     asked: int = 0
     failures: list[str] = field(default_factory=list)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import json
 import os
 import random
@@ -160,7 +159,7 @@ class Robot:
     connection: Connection
     policy: Policy
     tally: Tally
-    answers: int
+    over: asyncio.Event
 
     def __post_init__(self) -> None:
         self._draw = random.Random(self.number)
@@ -169,7 +168,7 @@ class Robot:
         self._id = f"robot-{self.number}"
 
     async def play(self) -> None:
-        while self.tally.answered < self.answers and not self.tally.wrong:
+        while not self.over.is_set() and not self.tally.wrong:
             # The possible memories: (steps, state). Several if steps were given up.
             self._places: list[tuple[int, State | None]] = [(0, None)]
             length = self._draw.randrange(2, 20)
@@ -232,34 +231,34 @@ def _same(expected: Any, got: Any) -> bool:
     return np.array_equal(expected, np.asarray(got, expected.dtype))
 
 
-async def play(
-    connections: Sequence[Connection], bundle: Path, answers: int, processes: Callable[[], list[int]], rest: int
-) -> tuple[Tally, Counter[str]]:
-    """Let a robot play by each of the connections until there are so many answers, `rest` between two disturbances.
+async def play(connections: Sequence[Connection], bundle: Path, processes: Callable[[], list[int]], rest: int) -> Tally:
+    """Let a robot play by each of the connections, through four disturbances with so many answers around each.
 
-    One of the server's processes is killed, or stopped for a while. Returns also how often that was.
+    One of the server's processes is killed, or stopped for a while.
     """
-    tally, did = Tally(), Counter[str]()
+    tally, over = Tally(), asyncio.Event()
     with Policy.load(bundle) as policy:
-        robots = [Robot(number, each, policy, tally, answers) for number, each in enumerate(connections)]
-        disturbing = asyncio.create_task(_disturb(tally, did, processes, rest))
+        robots = [Robot(number, each, policy, tally, over) for number, each in enumerate(connections)]
+        disturbing = asyncio.create_task(_disturb(tally, processes, rest))
+        disturbing.add_done_callback(lambda _: over.set())
         try:
             await asyncio.gather(*(robot.play() for robot in robots))
         finally:
             disturbing.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await disturbing
-    return tally, did
+    return tally
 
 
-async def _disturb(tally: Tally, did: Counter[str], processes: Callable[[], list[int]], rest: int) -> None:
+async def _disturb(tally: Tally, processes: Callable[[], list[int]], rest: int) -> None:
     draw = random.Random(1)
-    for how in itertools.cycle(["kill", "stop"]):
+    for how in ("kill", "stop", "kill", "stop", ""):
         until = tally.answered + rest
         while tally.answered < until:
             await asyncio.sleep(0.02)
+        if not how:
+            return
         pid = draw.choice(processes())
-        did[how] += 1
         with contextlib.suppress(ProcessLookupError):
             if how == "kill":
                 os.kill(pid, signal.SIGKILL)

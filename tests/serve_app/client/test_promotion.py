@@ -11,7 +11,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -598,6 +598,24 @@ def test_a_key_that_is_revoked_leaves_it_unfinished_and_the_way_on_is_said(
     monkeypatch.undo()
     outcome = promotion()
     assert outcome.outcome == PROMOTED and outcome.is_finished and server.state == ("2", None, None)
+
+
+def test_a_server_that_ends_leaves_it_unfinished_and_the_way_on_is_said(
+    run: Any, server: Server, served: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a minute in which it cannot be judged, and another in which it cannot be rolled back."""
+    with ExitStack() as ends:
+        monkeypatch.setattr(server, "port", ends.enter_context(served(server)))
+        promotion = run(seconds=600.0)
+
+        def end() -> None:
+            server.ask(30)
+            ends.close()
+
+        outcome = promotion(end)
+    assert outcome.outcome == STOPPED and not outcome.is_finished
+    assert "could not be judged for 60 s" in outcome.why and "'rlservo policy canary ur5 off'" in outcome.why, outcome
+    assert "end" not in promotion.events()
 
 
 # The log, and promotions resumed from it.
