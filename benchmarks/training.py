@@ -165,8 +165,8 @@ def measure(
             return Failed(runners, envs, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
     if not taken:
         return Failed(runners, envs, f"no iteration ended within {limit:.3g} s")
-    medians = [statistics.median(getattr(one, name) for one in taken) for name in Iteration.__dataclass_fields__]
-    return Row(*medians, runners, envs, len(taken))
+    medians = {name: statistics.median(getattr(one, name) for one in taken) for name in Iteration.__dataclass_fields__}
+    return Row(**medians, runners=runners, envs=envs, iterations=len(taken))
 
 
 def configuration(env: str, runners: int, envs: int, batch: int, *, rllib_connectors: bool = False) -> Any:
