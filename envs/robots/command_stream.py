@@ -153,7 +153,7 @@ class _RtdeConnection:
         receive = self._receive
         return Reading(
             receive.getTimestamp(), None, np.array(receive.getActualQ()), np.array(receive.getActualQd()),
-            receive.getRobotMode(), receive.getSafetyMode(), bool(receive.getRobotStatus() & 2),
+            bool(receive.getRobotStatus() & 2), receive.getRobotMode(), receive.getSafetyMode(),
             receive.getTargetSpeedFraction(), receive.isConnected(),
         )  # fmt: skip
 
