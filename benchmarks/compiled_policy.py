@@ -10,8 +10,6 @@ two figures of one round; their median counts. Written to bench/compiled_policy.
 
 from __future__ import annotations
 
-import argparse
-import json
 import re
 import subprocess
 import sys
@@ -23,8 +21,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
+from measuring import alternate, median_ratio, parser, show, write
 
 from rlservo.export.compiled.compile import Compiled, compile_bundle
 from rlservo.export.compiled.proof import FLAGS, find_compiler
@@ -81,50 +78,38 @@ def sides(bundle: Bundle, made: Compiled, compiler: str, folder: Path) -> dict[s
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--cc", help="C compiler; the machine's own by default")
-    options = parser.parse_args()
-    compiler = find_compiler(options.cc)
+    options = parser(__doc__)
+    options.add_argument("--rounds", type=int, default=7)
+    options.add_argument("--cc", help="C compiler; the machine's own by default")
+    args = options.parse_args()
+    compiler = find_compiler(args.cc)
     if compiler is None:
         sys.exit("there is no C compiler")
     torch.set_num_threads(1)
     document: dict[str, Any] = {"compiler": compiler}
-    table = Table("a step [µs]", *CHECKPOINTS)
+    rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for checkpoint in CHECKPOINTS:
             source = ROOT / "examples" / "checkpoints" / checkpoint
-            command = [
-                sys.executable,
-                "-m",
-                "rlservo.deploy.cli",
-                "export",
-                source,
-                "--out",
-                folder,
-                "--name",
-                checkpoint,
-            ]
-            subprocess.run([*map(str, command)], check=True, stdout=subprocess.DEVNULL)
+            command = [sys.executable, "-m", "rlservo.deploy.cli", "export", str(source), "--out", str(folder)]
+            subprocess.run([*command, "--name", checkpoint], check=True, stdout=subprocess.DEVNULL)
             bundle = load_bundle(folder / checkpoint)
             made = compile_bundle(bundle.path, folder / f"{checkpoint}-c", compiler=compiler)
             measured = sides(bundle, made, compiler, folder)
-            rounds = [{side: measure() for side, measure in measured.items()} for _ in range(options.rounds)]
-            document[checkpoint] = {side: min(each[side] for each in rounds) for side in measured}
-            ratios = {side: float(np.median([each[side] / each["C"] for each in rounds])) for side in measured}
+            found = alternate(measured, args.rounds)
+            document[checkpoint] = {side: min(own) for side, own in found.items()}
+            ratios = {side: median_ratio(own, found["C"]) for side, own in found.items()}
             document[checkpoint] |= {"as_multiple_of_C": ratios, "proof": made.about["proof"]}
         for side in document[CHECKPOINTS[0]]["as_multiple_of_C"]:
             figures = [(document[name][side], document[name]["as_multiple_of_C"][side]) for name in CHECKPOINTS]
-            table.add_row(side, *(f"{time:.1f} ({ratio:.1f} x)" for time, ratio in figures))
+            rows.append([side, *(f"{time:.1f} ({ratio:.1f} x)" for time, ratio in figures)])
         for what in ("slowest_observation", "longest"):
-            table.add_row(f"C, {what.replace('_', ' ')}", *(
-                f"{document[name]['proof']['step_us'][what]:.1f}" for name in CHECKPOINTS))  # fmt: skip
-        table.add_row("C, stack [bytes]", *(str(document[name]["proof"]["stack_bytes"]) for name in CHECKPOINTS))
-    Console().print(table)
-    out = ROOT / "bench"
-    out.mkdir(exist_ok=True)
-    (out / "compiled_policy.json").write_text(json.dumps(document, indent=2) + "\n")
+            longest = (f"{document[name]['proof']['step_us'][what]:.1f}" for name in CHECKPOINTS)
+            rows.append([f"C, {what.replace('_', ' ')}", *longest])
+        rows.append(["C, stack [bytes]", *(str(document[name]["proof"]["stack_bytes"]) for name in CHECKPOINTS)])
+    show("", ("a step [µs]", *CHECKPOINTS), rows)
+    write(args.out, "compiled_policy", document)
     if document[CHECKPOINTS[0]]["C"] > MOST_US:
         print(f"the UR5's step took more than {MOST_US} µs")
 

@@ -1,59 +1,84 @@
 """Coverage of estimates' intervals: how often those from repeated recordings contain the true return.
 
-Each repetition records episodes with one policy and estimates the return of others, whose true returns come from many
-episodes of their own. `--world linear` is a point pulled to 0, for fitted Q evaluation alone. Repetition i has the seed
-FIRST_SEED + i: seeds below 1000 were used when the limits of the estimates were chosen.
-Run: python benchmarks/estimates.py --importance-only; python benchmarks/estimates.py --world linear --episodes 100
+Each repetition records episodes with one policy that explores, and estimates the return of others, whose true returns
+come from many episodes of their own; by importance sampling, or `--fitted` by fitted Q evaluation for policies that do
+not explore. Repetition i has the seed FIRST_SEED + i: seeds below 1000 were used when the limits of the estimates were
+chosen. Worlds: CartPole; `linear`, a point pulled to 0, always fitted; and with `--bundle` the simulated UR5, whose
+candidates move the mean of that policy's actions by a part of their spread, or change the spread.
+
+    python benchmarks/estimates.py
+    python benchmarks/estimates.py --world linear --episodes 100
+    rlservo export examples/checkpoints/ur5_positioning --out policies --name ur5    # then half an hour:
+    python benchmarks/estimates.py --bundle policies/ur5 [--fitted]
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from rlservo.export.contract.log_probability import log_probability
 from rlservo.serve_app.replay.estimate import Estimate, Trajectory, fitted_estimate, importance_sampling
+from rlservo.serve_app.runtime.exploration import draw_action
+from rlservo.serve_app.runtime.policy import Policy
+
+FIRST_SEED, TRUTH_SEED = 1000, 10**6
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Claims:
+    """The estimates of one method about one candidate."""
+
+    widths: list[float] = field(default_factory=list)  # of those that are claimed
+    covered: int = 0  # of those
+    covered_unclaimed: int = 0
+    effective: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Candidate:
+    """A policy to estimate, as its world describes it, and the claims about it."""
+
+    name: str
+    policy: Any
+    truth: float = 0.0
+    claims: defaultdict[str, Claims] = field(default_factory=lambda: defaultdict(Claims))
+
+    def count(self, estimate: Estimate) -> None:
+        low, high = estimate.interval
+        claims, covers = self.claims[estimate.method], low <= self.truth <= high
+        claims.effective.append(estimate.effective_samples)
+        if estimate.supported:
+            claims.widths.append(high - low)
+            claims.covered += covers
+        else:
+            claims.covered_unclaimed += covers
+
+
+class World(NamedTuple):
+    """Candidates, and a function that records with a seed: it returns one that gives a candidate's trajectories."""
+
+    candidates: list[Candidate]
+    record: Callable[[int], Callable[[Candidate], list[Trajectory]]]
+
+
+# CartPole: a policy is its probability of pushing right, for observations [rows, 4].
 
 DIRECTION = np.array([0.05, 0.35, 2.2, 1.1])  # a linear policy that balances
 BEHAVIOUR = 1.0
 TRUTH_EPISODES = 20_000
 LIMIT = 200  # steps of an episode
-FIRST_SEED = 1000
-LINEAR_GAIN, LINEAR_STEPS = 0.5, 10  # of the recorded policy in the linear world
-
-Probability = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Probability of pushing right, for observations `[rows, 4]`."""
-
-
-@dataclass
-class Candidate:
-    """A policy to estimate, and the counts of the claims about it."""
-
-    name: str
-    probability: Probability
-    deterministic: bool
-    truth: float = 0.0
-    claimed: dict[str, int] = field(default_factory=dict)
-    covered: dict[str, int] = field(default_factory=dict)
-    widths: dict[str, list[float]] = field(default_factory=dict)
-    effective: dict[str, list[float]] = field(default_factory=dict)
-    covered_unclaimed: dict[str, int] = field(default_factory=dict)
-
-    def count(self, estimate: Estimate) -> None:
-        low, high = estimate.interval
-        covers = low <= self.truth <= high
-        method = estimate.method
-        self.effective.setdefault(method, []).append(estimate.effective_samples)
-        if estimate.supported:
-            self.claimed[method] = self.claimed.get(method, 0) + 1
-            self.covered[method] = self.covered.get(method, 0) + covers
-            self.widths.setdefault(method, []).append(high - low)
-        else:
-            self.covered_unclaimed[method] = self.covered_unclaimed.get(method, 0) + covers
+Probability = Callable[[Array], Array]
 
 
 def linear(gain: float, shift: float = 0.0) -> Probability:
@@ -61,13 +86,34 @@ def linear(gain: float, shift: float = 0.0) -> Probability:
 
 
 def greedy(direction: Sequence[float]) -> Probability:
-    weights = np.array(direction)
-    return lambda obs: (obs @ weights > 0).astype(np.float64)
+    return lambda obs: (obs @ np.array(direction) > 0).astype(np.float64)
 
 
-def run_episodes(
-    probability: Probability, episodes: int, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def cartpole(episodes: int, fitted: bool) -> World:
+    policies = {
+        "the recorded policy": linear(BEHAVIOUR), "gain 1.1": linear(1.1), "gain 1.3": linear(1.3),
+        "gain 1.6": linear(1.6), "gain 2": linear(2.0), "gain 4": linear(4.0), "gain 1, leaning": linear(1.0, 0.2),
+    }  # fmt: skip
+    if fitted:
+        policies = {
+            "greedy": greedy(DIRECTION.tolist()), "greedy, angle only": greedy([0, 0, 1, 0]),
+            "greedy, angle and its speed": greedy([0, 0, 1, 1]),
+        }  # fmt: skip
+    candidates = [Candidate(name, policy) for name, policy in policies.items()]
+    for candidate in candidates:
+        candidate.truth = float(balance(candidate.policy, TRUTH_EPISODES, TRUTH_SEED)[2].mean())
+
+    def record(seed: int) -> Callable[[Candidate], list[Trajectory]]:
+        obs, actions, lengths = balance(linear(BEHAVIOUR), episodes, seed)
+        return lambda candidate: [
+            pushes(obs[:length, index], actions[:length, index], candidate.policy)
+            for index, length in enumerate(lengths)
+        ]
+
+    return World(candidates, record)
+
+
+def balance(probability: Probability, episodes: int, seed: int) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
     """Return (observations `[steps, episodes, 4]`, actions `[steps, episodes]`, lengths)."""
     env = gym.make_vec("CartPole-v1", num_envs=episodes, vectorization_mode="vector_entry_point")
     rng = np.random.default_rng(seed)
@@ -89,50 +135,49 @@ def run_episodes(
     return np.array(seen), np.array(done), lengths
 
 
-def trajectories(
-    obs: NDArray[np.float64],
-    actions: NDArray[np.int64],
-    lengths: NDArray[np.int64],
-    recorded: Probability | None,
-    candidate: Candidate,
-) -> list[Trajectory]:
-    """Return the parts of an estimate; `recorded` is None if the log-probabilities are not known."""
-    found = []
-    one_hot = np.eye(2, dtype=np.float32)
-    for index, length in enumerate(lengths):
-        rows, taken = obs[:length, index], actions[:length, index]
-        right = candidate.probability(rows)
-        weights = None
-        if recorded is not None:
-            known = recorded(rows)
-            with np.errstate(divide="ignore"):
-                weights = np.log(np.where(taken == 1, right, 1 - right)) - np.log(
-                    np.where(taken == 1, known, 1 - known)
-                )
-        chosen = one_hot[(right > 0.5).astype(np.int64)]
-        found.append(Trajectory(np.ones(length), weights, rows.astype(np.float32), one_hot[taken], chosen))
-    return found
+def pushes(rows: Array, taken: NDArray[np.int64], policy: Probability) -> Trajectory:
+    """Return an episode as the estimate of a policy reads it."""
+    one_hot, right, known = np.eye(2, dtype=np.float32), policy(rows), linear(BEHAVIOUR)(rows)
+    with np.errstate(divide="ignore"):
+        weights = np.log(np.where(taken == 1, right, 1 - right)) - np.log(np.where(taken == 1, known, 1 - known))
+    chosen = one_hot[(right > 0.5).astype(np.int64)]
+    return Trajectory(np.ones(len(rows)), weights, rows.astype(np.float32), one_hot[taken], chosen)
 
 
-def study(candidates: list[Candidate], recorded: Probability, episodes: int, seeds: range) -> None:
-    """Fill in the candidates' counts."""
+# A point that earns -x^2 at x and moves by half its action: a policy is (noise of the recorded one, gain).
+
+LINEAR_GAIN, LINEAR_STEPS = 0.5, 10  # of the recorded policy
+
+
+def point(episodes: int) -> World:
+    """Return policies that pull harder or weaker than the recorded one, which explores by noise.
+
+    They differ from that of the tests (noise 0.5, pulls harder by 0.2), on which the method was tuned.
+    """
+    candidates = [
+        Candidate(f"recorded with noise {noise:g}, gain {LINEAR_GAIN + shift:g}", (noise, LINEAR_GAIN + shift))
+        for noise, shift in [(0.5, 0.2), (0.5, 0.0), (0.5, -0.3), (0.5, 0.5), (0.2, 0.2), (0.2, -0.1)]
+    ]
     for candidate in candidates:
-        candidate.truth = float(run_episodes(candidate.probability, TRUTH_EPISODES, 10**6)[2].mean())
-    for seed in seeds:
-        obs, actions, lengths = run_episodes(recorded, episodes, seed)
-        rng = np.random.default_rng(seed)
-        for candidate in candidates:
-            made = trajectories(obs, actions, lengths, recorded, candidate)
-            for one in importance_sampling(made, 1.0, rng):
-                candidate.count(one)
-            if candidate.deterministic:
-                candidate.count(fitted_estimate(made, 1.0, rng))
+        truth, _ = pull(candidate.policy[1], 0.0, 10 * TRUTH_EPISODES, TRUTH_SEED)
+        candidate.truth = float(-(truth**2).sum(axis=1).mean())
+
+    def record(seed: int) -> Callable[[Candidate], list[Trajectory]]:
+        def trajectories(candidate: Candidate) -> list[Trajectory]:
+            noise, gain = candidate.policy
+            return [
+                Trajectory(-(x**2), None, *(rows[:, None].astype(np.float32) for rows in (x, action, -gain * x)))
+                for x, action in zip(*pull(LINEAR_GAIN, noise, episodes, seed), strict=True)
+            ]
+
+        return trajectories
+
+    return World(candidates, record)
 
 
-def linear_episodes(
-    gain: float, noise: float, episodes: int, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (positions, actions) `[episodes, steps]` of a point that earns -x^2 at x and moves by half its action."""
+def pull(gain: float, noise: float, episodes: int, seed: int) -> tuple[Array, Array]:
+    """Return (positions, actions) `[episodes, steps]`."""
+    rng = np.random.default_rng(seed)
     position = rng.normal(size=episodes)
     positions, actions = [], []
     for _ in range(LINEAR_STEPS):
@@ -143,66 +188,128 @@ def linear_episodes(
     return np.array(positions).T, np.array(actions).T
 
 
-def linear_study(episodes: int, seeds: range) -> list[Candidate]:
-    """Return fitted Q's counts for policies that pull harder or weaker than the recorded one, which explores by noise.
+# The UR5: a policy is the shipped one, its mean moved by so many standard deviations, and their logarithm by so much.
 
-    The candidates differ from that of the tests (noise 0.5, pulls harder by 0.2), on which it was tuned.
-    """
-    found = []
-    for noise, shift in [(0.5, 0.2), (0.5, 0.0), (0.5, -0.3), (0.5, 0.5), (0.2, 0.2), (0.2, -0.1)]:
-        candidate = Candidate(f"recorded with noise {noise:g}, gain {LINEAR_GAIN + shift:g}", linear(0.0), True)
-        truth, _ = linear_episodes(LINEAR_GAIN + shift, 0.0, 10 * TRUTH_EPISODES, np.random.default_rng(10**6))
-        candidate.truth = float(-(truth**2).sum(axis=1).mean())
-        for seed in seeds:
-            rng = np.random.default_rng(seed)
-            positions, actions = linear_episodes(LINEAR_GAIN, noise, episodes, rng)
-            made = [
-                Trajectory(
-                    -(x**2),
-                    None,
-                    x[:, None].astype(np.float32),
-                    a[:, None].astype(np.float32),
-                    (-(LINEAR_GAIN + shift) * x[:, None]).astype(np.float32),
-                )
-                for x, a in zip(positions, actions, strict=True)
-            ]
-            candidate.count(fitted_estimate(made, 1.0, rng))
-        found.append(candidate)
+ENV = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
+ABREAST = 64  # episodes that run side by side
+Variant = tuple[float, float]
+VARIANTS: dict[str, Variant] = {
+    "the recorded policy": (0.0, 0.0),
+    "mean moved by 0.03 of the spread": (0.03, 0.0),
+    "spread 2% smaller": (0.0, -0.02),
+    "mean moved by 0.3 of the spread": (0.3, 0.0),
+}
+DETERMINISTIC: dict[str, Variant] = {  # with e^-20 of the spread
+    "the mode": (0.0, -20.0),
+    "the mode moved by 0.3 of the spread": (0.3, -20.0),
+    "the mode moved by the spread": (1.0, -20.0),
+}
+Step = tuple[float, Array, NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""Reward, logarithms of the weights `[VARIANTS]`, observation, action, actions `[DETERMINISTIC, elements]`."""
+
+
+def arm(policy: Policy, args: argparse.Namespace) -> World:
+    variants = DETERMINISTIC if args.fitted else VARIANTS
+    candidates = [Candidate(name, index) for index, name in enumerate(variants)]
+    for candidate, variant in zip(candidates, variants.values(), strict=True):
+        candidate.truth = mean_return(drive(policy, variant, args.truth, TRUTH_SEED))
+        print(f"{candidate.name}: true return {candidate.truth:.3f}", flush=True)
+    recorded = drive(policy, (0.0, 0.0), args.episodes * args.repetitions, 0)
+    if not args.fitted:  # more episodes than above (one recording is a hundredth of them) give a better truth
+        candidates[0].truth = mean_return(recorded)
+
+    def record(seed: int) -> Callable[[Candidate], list[Trajectory]]:
+        episodes = recorded[(seed - args.first_seed) * args.episodes :][: args.episodes]
+        return lambda candidate: [trajectory_of(one, candidate.policy, args.fitted) for one in episodes]
+
+    return World(candidates, record)
+
+
+def mean_return(episodes: list[list[Step]]) -> float:
+    return float(np.mean([sum(reward for reward, *_ in one) for one in episodes]))
+
+
+def trajectory_of(steps: list[Step], variant: int, fitted: bool) -> Trajectory:
+    rewards, weights, obs, actions, chosen = map(np.array, zip(*steps, strict=True))
+    return Trajectory(
+        rewards, None if fitted else weights[:, variant], obs, actions, chosen[:, variant if fitted else 0]
+    )
+
+
+def move(inputs: NDArray[Any], variant: Variant) -> Array:
+    """Return a variant's distribution parameters from the policy's: `[rows, (mean, log_std)]`."""
+    mean, log_std = np.split(np.asarray(inputs, np.float64), 2, axis=1)
+    return np.concatenate([mean + variant[0] * np.exp(log_std), log_std + variant[1]], axis=1)
+
+
+def drive(policy: Policy, variant: Variant, episodes: int, first_seed: int) -> list[list[Step]]:
+    """Drive the arm with a variant of the policy; return the episodes by seed, i is reset with `first_seed` + i."""
+    contract, rng = policy.contract, np.random.default_rng(first_seed)
+    assert contract.distribution is not None
+    found: list[list[Step]] = [[] for _ in range(episodes)]
+    waiting = iter(enumerate(found))
+    arms = [(gym.make(ENV), one, number) for number, one in itertools.islice(waiting, ABREAST)]
+    seen = [env.reset(seed=first_seed + number)[0] for env, _, number in arms]
+    while arms:
+        policy.act(np.stack(seen), explore=True)
+        assert policy.draw is not None
+        inputs = policy.draw.inputs
+        drawn = draw_action(move(inputs, variant), contract.distribution, contract.action_space, rng)
+        own, *moved = (
+            log_probability(move(inputs, other), drawn.own, contract.distribution, contract.action_space)
+            for other in (variant, *VARIANTS.values())
+        )
+        ratios = np.stack(moved, axis=1) - own[:, None]
+        modes = [
+            draw_action(move(inputs, other), contract.distribution, contract.action_space, rng).action["action"]
+            for other in DETERMINISTIC.values()
+        ]
+        still, following_obs = [], []
+        for row, (env, episode, number) in enumerate(arms):
+            action = drawn.action["action"][row]
+            obs, reward, terminated, truncated, _ = env.step(action)
+            chosen = np.stack([mode[row] for mode in modes])
+            arrays = [np.asarray(array, np.float32) for array in (seen[row], action, chosen)]
+            episode.append((float(reward), ratios[row], arrays[0], arrays[1], arrays[2]))
+            if terminated or truncated:
+                following = next(waiting, None)
+                if following is None:
+                    env.close()
+                    continue
+                number, episode = following
+                obs = env.reset(seed=first_seed + number)[0]
+            still.append((env, episode, number))
+            following_obs.append(obs)
+        arms, seen = still, following_obs
     return found
 
 
-def candidates_of_the_study() -> list[Candidate]:
-    return [
-        Candidate("the recorded policy", linear(BEHAVIOUR), False),
-        Candidate("gain 1.1", linear(1.1), False),
-        Candidate("gain 1.3", linear(1.3), False),
-        Candidate("gain 1.6", linear(1.6), False),
-        Candidate("gain 2", linear(2.0), False),
-        Candidate("gain 4", linear(4.0), False),
-        Candidate("gain 1, leaning", linear(1.0, 0.2), False),
-        Candidate("greedy", greedy(DIRECTION.tolist()), True),
-        Candidate("greedy, angle only", greedy([0, 0, 1, 0]), True),
-        Candidate("greedy, angle and its speed", greedy([0, 0, 1, 1]), True),
-    ]
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=600)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--world", choices=["cartpole", "linear"], default="cartpole")
+    parser.add_argument("--bundle", type=Path, help="the UR5's policy, for its world")
+    parser.add_argument("--fitted", action="store_true", help="fitted Q evaluation, and not importance sampling")
+    parser.add_argument("--episodes", type=int, default=600, help="in each recording")
     parser.add_argument("--repetitions", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    parser.add_argument("--importance-only", action="store_true", help="leave out fitted Q evaluation, which is slow")
-    parser.add_argument("--world", choices=["cartpole", "linear"], default="cartpole")
-    arguments = parser.parse_args()
-    seeds = range(arguments.first_seed, arguments.first_seed + arguments.repetitions)
-    if arguments.world == "linear":
-        candidates = linear_study(arguments.episodes, seeds)
+    parser.add_argument("--truth", type=int, default=4000, help="UR5: episodes for each candidate's true return")
+    args = parser.parse_args()
+    args.fitted |= args.world == "linear"
+    if args.bundle is not None:
+        with Policy.load(args.bundle) as policy:
+            world = arm(policy, args)
     else:
-        candidates = candidates_of_the_study()
-        if arguments.importance_only:
-            candidates = [candidate for candidate in candidates if not candidate.deterministic]
-        study(candidates, linear(BEHAVIOUR), arguments.episodes, seeds)
-    report(candidates, arguments.repetitions, arguments.episodes)
+        world = point(args.episodes) if args.world == "linear" else cartpole(args.episodes, args.fitted)
+    for repetition in range(args.repetitions):
+        recording = world.record(args.first_seed + repetition)
+        for candidate in world.candidates:
+            made, rng = recording(candidate), np.random.default_rng(args.first_seed + repetition)
+            estimates = [fitted_estimate(made, 1.0, rng)] if args.fitted else importance_sampling(made, 1.0, rng)
+            for estimate in estimates:
+                candidate.count(estimate)
+        if (repetition + 1) % 10 == 0:
+            print(f"{repetition + 1} of {args.repetitions} repetitions estimated", flush=True)
+    report(world.candidates, args.repetitions, args.episodes)
 
 
 def report(candidates: list[Candidate], repetitions: int, episodes: int) -> None:
@@ -210,14 +317,13 @@ def report(candidates: list[Candidate], repetitions: int, episodes: int) -> None
     print(f"{repetitions} repetitions of {episodes} episodes; 95% intervals")
     for candidate in candidates:
         print(f"{candidate.name}: true return {candidate.truth:.4g}")
-        for method in sorted({*candidate.claimed, *candidate.covered_unclaimed}):
-            claimed, covered = candidate.claimed.get(method, 0), candidate.covered.get(method, 0)
-            width = float(np.mean(candidate.widths[method])) if claimed else float("nan")
-            outside = candidate.covered_unclaimed.get(method, 0)
+        for method, claims in sorted(candidate.claims.items()):
+            claimed = len(claims.widths)
+            width = float(np.mean(claims.widths)) if claimed else float("nan")
             print(
-                f"  {method}: claimed {claimed}, covered {covered} of them, mean width {width:.3g}; "
-                f"covered {outside} of {repetitions - claimed} not claimed; "
-                f"mean of effective episodes {np.mean(candidate.effective[method]):.0f}"
+                f"  {method}: claimed {claimed}, covered {claims.covered} of them, mean width {width:.3g}; "
+                f"covered {claims.covered_unclaimed} of {repetitions - claimed} not claimed; "
+                f"mean of effective episodes {np.mean(claims.effective):.0f}"
             )
 
 

@@ -10,7 +10,6 @@ The ratio of CPU times says more on a busy machine. Written to bench/export_poli
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import statistics
@@ -19,23 +18,21 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from measuring import CPU, WALL, alternate, column, median_ratio, parser, rate, show, write
 
 from rlservo.export.contract.bundle import load_bundle
 from rlservo.export.contract.ort_session import open_ort_session
 from rlservo.serve_app.runtime.policy import Policy
 
-ROOT = Path(__file__).resolve().parent.parent
-CHECKPOINT = ROOT / "examples" / "checkpoints" / "ur5_positioning"
-OUT = ROOT / "bench"
+CHECKPOINT = Path(__file__).resolve().parent.parent / "examples" / "checkpoints" / "ur5_positioning"
 MOST_SECONDS = 8.0  # issue 3's targets
 MOST_OVER_BARE = {1: 1.5, 1024: 1.1}
-CALLS = {1: 3000, 1024: 20}  # a round, a few hundredths of a second
+ROUND_S = 0.1
 
 
 def export(out: Path) -> dict[str, float]:
@@ -50,63 +47,40 @@ def export(out: Path) -> dict[str, float]:
     return {"seconds": wall, "cpu_seconds": cpu, "peak_memory_mb": json.loads(done.stdout)["peak_memory_mb"]}
 
 
-def compare(act: Callable[[], Any], bare: Callable[[], Any], calls: int, rounds: int) -> dict[str, float]:
+def compare(act: Callable[[], Any], bare: Callable[[], Any], rounds: int) -> dict[str, float]:
     """Return the microseconds per call of each, measured alternately, and the ratios."""
-    found: dict[str, list[float]] = {"act": [], "bare": [], "act_cpu": [], "bare_cpu": []}
-    for number in range(rounds + 1):
-        sides = [("act", act), ("bare", bare)]
-        for name, call in sides if number % 2 else reversed(sides):
-            began, cpu_began = time.perf_counter(), time.process_time()
-            for _ in range(calls):
-                call()
-            wall, cpu = time.perf_counter() - began, time.process_time() - cpu_began
-            if number:  # the first round warms up
-                found[name].append(wall / calls * 1e6)
-                found[f"{name}_cpu"].append(cpu / calls * 1e6)
-    ratio = statistics.median(a / b for a, b in zip(found["act"], found["bare"], strict=True))
-    cpu_ratio = statistics.median(a / b for a, b in zip(found["act_cpu"], found["bare_cpu"], strict=True))
+    found = alternate({"act": partial(rate, act, ROUND_S), "bare": partial(rate, bare, ROUND_S)}, rounds)
+    per_s = {(name, clock): column(found[name], clock) for name in found for clock in (WALL, CPU)}
     return {
-        **{name: statistics.median(values) for name, values in found.items()},
-        "ratio": ratio,
-        "cpu_ratio": cpu_ratio,
+        **{f"{name}{'_cpu' * clock}": 1e6 / statistics.median(rates) for (name, clock), rates in per_s.items()},
+        "ratio": median_ratio(per_s["bare", WALL], per_s["act", WALL]),
+        "cpu_ratio": median_ratio(per_s["bare", CPU], per_s["act", CPU]),
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure an export, and Policy.act against the bare session.")
-    parser.add_argument("--rounds", type=int, default=15, help="rounds of each comparison")
-    rounds = parser.parse_args().rounds
-    results: dict[str, Any] = {}
+    options = parser(__doc__)
+    options.add_argument("--rounds", type=int, default=15, help="rounds of each comparison")
+    args = options.parse_args()
+    rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as folder:
-        results["export"] = cost = export(Path(folder))
+        cost = export(Path(folder))
+        results: dict[str, Any] = {"export": cost}
         bundle = load_bundle(folder)
         policy, session = Policy.load(folder), open_ort_session(bundle.onnx)
         rng = np.random.default_rng(0)
-        for batch, calls in CALLS.items():
+        for batch, most in MOST_OVER_BARE.items():
             obs = rng.standard_normal((batch, 27)).astype(np.float32)
-            one = obs[0] if batch == 1 else obs
-            results[f"batch {batch}"] = compare(
-                lambda one=one: policy.act(one),  # type: ignore[misc]  # bound now, not when it is called
-                lambda obs=obs: session.run(["action"], {"obs": obs}),  # type: ignore[misc]
-                calls,
-                rounds,
-            )
-    console = Console()
-    console.print(
+            act = partial(policy.act, obs[0] if batch == 1 else obs)
+            results[f"batch {batch}"] = one = compare(act, partial(session.run, ["action"], {"obs": obs}), args.rounds)
+            numbers = [one["act"], one["bare"], one["ratio"], one["cpu_ratio"], most]
+            rows.append([f"{batch:,}", *(f"{number:.2f}" for number in numbers)])
+    print(
         f"export: {cost['seconds']:.1f} s (at most {MOST_SECONDS:g} wanted), {cost['cpu_seconds']:.1f} s of CPU time, "
-        f"{cost['peak_memory_mb']:.0f} MB at the peak",
-        highlight=False,
+        f"{cost['peak_memory_mb']:.0f} MB at the peak"
     )
-    table = Table()
-    for column in ("observations", "Policy.act [us]", "session.run [us]", "ratio", "of CPU times", "at most"):
-        table.add_column(column, justify="right")
-    for batch, most in MOST_OVER_BARE.items():
-        one = results[f"batch {batch}"]
-        numbers = [one["act"], one["bare"], one["ratio"], one["cpu_ratio"], most]
-        table.add_row(f"{batch:,}", *(f"{number:.2f}" for number in numbers))
-    console.print(table)
-    OUT.mkdir(exist_ok=True)
-    (OUT / "export_policy.json").write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    show("", ("observations", "Policy.act [us]", "session.run [us]", "ratio", "of CPU times", "at most"), rows)
+    write(args.out, "export_policy", results)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ are theirs. Medians of five rounds. Written to bench/robot_server.json too.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -19,13 +18,13 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import grpc
 import numpy as np
-from rich.console import Console
-from rich.table import Table
+from measuring import CPU, WALL, column, parser, rate, show, write
 
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
@@ -96,25 +95,20 @@ def starts(count: int = 10) -> tuple[list[float], list[float]]:
     return started, killed
 
 
-def speed(line: str, seconds: float, *, is_ur: bool) -> tuple[list[float], list[float]]:
-    """Return steps per second on the fast clock, and steps per second of the server's CPU time, a round each."""
+def speed(line: str, seconds: float, *, is_ur: bool) -> list[tuple[float, float]]:
+    """Return steps per second on the fast clock, and per second of the server's CPU time, for each round."""
     servers = RobotServers()
-    rounds, of_cpu = [], []
+    rounds = []
     try:
         port = servers.start(line)
-        robot, pid = Robot(port, is_ur=is_ur), servers.running[port]
+        robot = Robot(port, is_ur=is_ur)
+        cpu_s = partial(cpu_seconds, servers.running[port])
         for _ in range(ROUNDS):
             robot.reset()
-            steps, began, cpu_began = 0, time.perf_counter(), cpu_seconds(pid)
-            while (elapsed := time.perf_counter() - began) < seconds:
-                for _ in range(20):
-                    robot.step()
-                steps += 20
-            rounds.append(steps / elapsed)
-            of_cpu.append(steps / (cpu_seconds(pid) - cpu_began))
+            rounds.append(rate(robot.step, seconds, cpu_s=cpu_s))
     finally:
         servers.close()
-    return rounds, of_cpu
+    return rounds
 
 
 def cpu_seconds(pid: int) -> float:
@@ -174,57 +168,41 @@ def real_time(count: int, seconds: float) -> tuple[float, list[float]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure the robot servers.")
-    parser.add_argument("--seconds", type=float, default=3.0, help="per round")
-    parser.add_argument("--servers", type=int, default=20, help="how many at once in real time")
-    parser.add_argument("--out", type=Path, default=Path("bench"))
-    parser.add_argument("--robo-gym", type=Path, nargs="*", default=[], help="Pythons that have robo-gym")
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--seconds", type=float, default=3.0, help="per round")
+    options.add_argument("--servers", type=int, default=20, help="how many at once in real time")
+    options.add_argument("--robo-gym", type=Path, nargs="*", default=[], help="Pythons that have robo-gym")
+    args = options.parse_args()
     if missing := [str(python) for python in args.robo_gym if not python.is_file()]:
-        parser.error(f"--robo-gym {missing[0]}: there is no such file")
+        options.error(f"--robo-gym {missing[0]}: there is no such file")
 
     started, killed = starts()
-    ur, ur_cpu = speed(UR5 + "10", args.seconds, is_ur=True)
-    mir, mir_cpu = speed(MIR100, args.seconds, is_ur=False)
-    theirs = [robo_gym_speed(python, args.seconds) for python in args.robo_gym]
-    together, rates = real_time(args.servers, max(args.seconds, 5.0))
-    results = {
-        "start_s": started,
-        "kill_s": killed,
-        "ur5_steps_per_s": ur,
-        "ur5_steps_per_server_cpu_s": ur_cpu,
-        "mir100_steps_per_s": mir,
-        "mir100_steps_per_server_cpu_s": mir_cpu,
-        "robo_gym": theirs,
-        "servers": args.servers,
-        "start_together_s": together,
-        "real_time_hz": rates,
-    }
-    table = Table(title="Robot servers")
-    for column in ("what", "median", "worst", "goal"):
-        table.add_column(column, justify="left" if column == "what" else "right")
-    table.add_row("start a UR5 server (s)", f"{statistics.median(started):.2f}", f"{max(started):.2f}", "2")
-    table.add_row("kill it (s)", f"{statistics.median(killed):.2f}", f"{max(killed):.2f}", "1")
-    table.add_row("UR5 steps/s, our own client", f"{statistics.median(ur):,.0f}", f"{min(ur):,.0f}", "1,000")
-    table.add_row("  per second of the server's CPU", f"{statistics.median(ur_cpu):,.0f}", f"{min(ur_cpu):,.0f}", "")
-    table.add_row("MiR100 steps/s, our own client", f"{statistics.median(mir):,.0f}", f"{min(mir):,.0f}", "500")
-    table.add_row("  per second of the server's CPU", f"{statistics.median(mir_cpu):,.0f}", f"{min(mir_cpu):,.0f}", "")
-    for one in theirs:
+    results: dict[str, Any] = {"start_s": started, "kill_s": killed}
+    rows = [row("start a UR5 server (s)", started, max, ".2f", "2"), row("kill it (s)", killed, max, ".2f", "1")]
+    for name, robot, line, goal in (("ur5", "UR5", f"{UR5}10", "1,000"), ("mir100", "MiR100", MIR100, "500")):
+        rounds = speed(line, args.seconds, is_ur=name == "ur5")
+        results[f"{name}_steps_per_s"], results[f"{name}_steps_per_server_cpu_s"] = wall, cpu = (
+            column(rounds, WALL), column(rounds, CPU),
+        )  # fmt: skip
+        rows.append(row(f"{robot} steps/s, our own client", wall, min, ",.0f", goal))
+        rows.append(row("  per second of the server's CPU", cpu, min, ",.0f"))
+    results["robo_gym"] = [robo_gym_speed(python, args.seconds) for python in args.robo_gym]
+    for one in results["robo_gym"]:
         for name, robot in (("ur5", "UR5"), ("mir100", "MiR100")):
-            steps, cpu_ms = one[name]["steps_per_s"], one[name]["client_cpu_ms_per_step"]
             what = f"{robot} steps/s, robo-gym's environment (Python {one['python']}, protobuf {one['protobuf']})"
-            table.add_row(what, f"{statistics.median(steps):,.0f}", f"{min(steps):,.0f}", "")
-            table.add_row(
-                "  its client's CPU per step (ms)", f"{statistics.median(cpu_ms):.2f}", f"{max(cpu_ms):.2f}", ""
-            )
-    table.add_row(f"start {args.servers} at once (s)", f"{together:.1f}", "", "")
-    table.add_row(
-        f"{args.servers} UR5s at {REAL_RATE_HZ} Hz, real clock [Hz]", f"{statistics.median(rates):.2f}",
-        f"{min(rates):.2f}", str(REAL_RATE_HZ),
-    )  # fmt: skip
-    Console().print(table)
-    args.out.mkdir(exist_ok=True)
-    (args.out / "robot_server.json").write_text(json.dumps(results, indent=2) + "\n")
+            rows.append(row(what, one[name]["steps_per_s"], min, ",.0f"))
+            rows.append(row("  its client's CPU per step (ms)", one[name]["client_cpu_ms_per_step"], max, ".2f"))
+    together, rates = real_time(args.servers, max(args.seconds, 5.0))
+    results |= {"servers": args.servers, "start_together_s": together, "real_time_hz": rates}
+    rows.append(row(f"start {args.servers} at once (s)", [together], max, ".1f"))
+    what = f"{args.servers} UR5s at {REAL_RATE_HZ} Hz, real clock [Hz]"
+    rows.append(row(what, rates, min, ".2f", str(REAL_RATE_HZ)))
+    show("Robot servers", ("what", "median", "worst", "goal"), rows)
+    write(args.out, "robot_server", results)
+
+
+def row(what: str, figures: list[float], worst: Callable[[list[float]], float], form: str, goal: str = "") -> list[str]:
+    return [what, format(statistics.median(figures), form), format(worst(figures), form), goal]
 
 
 if __name__ == "__main__":

@@ -140,12 +140,13 @@ def _bentoml(case: Case, port: int, folder: Path) -> Peer:
     return Peer(command, environment={"POLICY_ONNX": case.onnx, **home}, rounds=1)
 
 
-def _on_ray(script: str, what: Path | str, port: int, folder: Path, **options: object) -> Peer:
+def _on_ray(kind: str, source: Path | str, port: int, folder: Path, **options: object) -> Peer:
     # A token of its own: a local ray.init() would write one into the user's home and keep using it.
     own = {"RAY_TMPDIR": str(folder), "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
     own["RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S"] = "60"  # after 5 s Serve kills a proxy that is not ready yet
-    own |= {} if options.pop("is_plain", False) else SWITCHES
-    command = [sys.executable, str(PEERS / script), str(port), str(what)]
+    own["PYTHONPATH"] = str(PEERS)  # for the replica
+    own |= SWITCHES if kind in ("ours", "bare") else {}
+    command = [sys.executable, str(PEERS / "on_ray.py"), str(port), kind, str(source)]
     return Peer(command, environment=own, starts_in_s=120, **options)  # type: ignore[arg-type]
 
 
@@ -163,18 +164,15 @@ MAKERS: dict[str, Make] = {
     "mosec": _mosec,
     "uvicorn + FastAPI": _fastapi,
     OURS_ON_RAY: lambda case, port, folder: _on_ray(
-        "rlservo_on_ray.py", case.policies, port, folder, path=f"/v1/policies/{case.bundle.parent.name}/act"
+        "ours", case.policies, port, folder, path=f"/v1/policies/{case.bundle.parent.name}/act"
     ),
-    BARE_ON_RAY: lambda case, port, folder: _on_ray("rlservo_on_ray.py", case.onnx, port, folder),
+    BARE_ON_RAY: lambda case, port, folder: _on_ray("bare", case.onnx, port, folder),
     "MLServer": _mlserver,
     "LitServe": _litserve,
     "BentoML": _bentoml,
-    "Ray Serve defaults": lambda case, port, folder: _on_ray(
-        "ray_serve_defaults.py", case.onnx, port, folder, is_plain=True, rounds=1
-    ),
+    "Ray Serve defaults": lambda case, port, folder: _on_ray("defaults", case.onnx, port, folder, rounds=1),
     "RLlib's Serve example": lambda case, port, folder: _on_ray(
-        "rllib_example.py", case.checkpoint, port, folder, is_plain=True, rounds=1, path="/rllib-rlmodule",
-        key="observation", checks=False,
+        "rllib", case.checkpoint, port, folder, rounds=1, key="observation", checks=False
     ),
 }  # fmt: skip
 

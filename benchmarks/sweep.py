@@ -12,7 +12,6 @@ it has ended; checkpoints, curves and logs to `bench/sweep-NAME/`.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 import subprocess
@@ -29,6 +28,7 @@ import shared.training_run as training_run  # before Ray  # isort: skip
 import evaluate_shipped
 import train_shipped
 import yaml
+from measuring import parser
 
 import rlservo
 from rlservo.serve_app.rollout.report import wilson_interval
@@ -107,25 +107,24 @@ def line_of(trial: Trial, curve: str, evaluations: list[evaluate_shipped.Evaluat
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = parser(__doc__)
     names = sorted(path.stem for path in VARIANTS.glob("*.yaml"))
-    parser.add_argument("name", choices=names)
-    parser.add_argument("--variants", nargs="+", default=["all"], metavar="NAME", help="of its file; all by default")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
-    parser.add_argument("--episodes", type=int, default=400, help="of each evaluation")
-    parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="of the episodes that are judged")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trainings at a time")
-    parser.add_argument("--out", type=Path, default=Path("bench"))
-    args = parser.parse_args()
+    options.add_argument("name", choices=names)
+    options.add_argument("--variants", nargs="+", default=["all"], metavar="NAME", help="of its file; all by default")
+    options.add_argument("--seeds", type=int, nargs="+", default=[0])
+    options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
+    options.add_argument("--episodes", type=int, default=400, help="of each evaluation")
+    options.add_argument("--first-seed", type=int, default=FIRST_SEED, help="of the episodes that are judged")
+    options.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trainings at a time")
+    args = options.parse_args()
     if min(args.episodes - 1, args.jobs) < 1 or args.first_seed < 0:
-        parser.error("expected at least 2 --episodes, 1 --jobs and a --first-seed of 0 or more")
+        options.error("expected at least 2 --episodes, 1 --jobs and a --first-seed of 0 or more")
     try:
         variants = variants_of(args.name, args.variants)
         for settings in variants.values():
             train_shipped.change_settings(settings, args.set)
     except ValueError as error:
-        parser.error(str(error))
+        options.error(str(error))
     folder = args.out / f"sweep-{args.name}"
     trials = [
         Trial(variant, seed, settings, folder / f"{variant.replace(' ', '-').replace('/', '-')}-{seed}")

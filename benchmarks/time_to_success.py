@@ -10,20 +10,17 @@ RLlib samples with one process per core. Stable-Baselines3 (`pip install stable-
 network, batches, rates and weight of the value's loss, its own VecNormalize, torch's threads, and all environments in
 one process or one each; it lacks RLlib's KL term and bound of the value's loss, and its first weights and single
 standard deviation are always those of `quick`. Success is measured in training, with exploration; RLlib's last episodes
-are those of whole iterations, so slightly more than 100. Table and plot are written to `bench/time_to_success.json` and
-`.png`.
+are those of whole iterations, so slightly more than 100. The curves are written to `bench/time_to_success.json`.
 """
 
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import functools
 import importlib.util
 import itertools
-import json
 import os
 import sys
 import time
@@ -40,6 +37,7 @@ import gymnasium
 import numpy as np
 import torch
 import train_shipped
+from measuring import parser, write
 from sweep import variants_of
 
 WINDOW = 100  # episodes
@@ -124,25 +122,23 @@ def comparable() -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", nargs="?", default="ur5_positioning", choices=comparable())
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--only", choices=TRAINERS, nargs="+", default=list(TRAINERS))
-    parser.add_argument("--variants", nargs="+", default=[], metavar="NAME", help="of variants/NAME.yaml, or all")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
-    parser.add_argument("--out", type=Path, default=Path("bench"))
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("name", nargs="?", default="ur5_positioning", choices=comparable())
+    options.add_argument("--seeds", type=int, nargs="+", default=[0])
+    options.add_argument("--only", choices=TRAINERS, nargs="+", default=list(TRAINERS))
+    options.add_argument("--variants", nargs="+", default=[], metavar="NAME", help="of variants/NAME.yaml, or all")
+    options.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as train_shipped.py's")
+    args = options.parse_args()
     try:
         variants = variants_of(args.name, args.variants)
         for settings in variants.values():
             train_shipped.change_settings(settings, args.set)
     except ValueError as error:
-        parser.error(str(error))
+        options.error(str(error))
     trainers = list(args.only)
     if importlib.util.find_spec("stable_baselines3") is None:
         print("Stable-Baselines3 is not installed (pip install stable-baselines3): RLlib alone")
         trainers = [name for name in trainers if name == "rllib"]
-    args.out.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 would measure the machine's other work
     training_run.pickle_by_value(train_shipped)  # its callback, in processes that do not find it
     runs: list[Run] = []
@@ -155,32 +151,13 @@ def main() -> None:
                 print(f"{run.trainer}, seed {seed}: {steps:>10,} steps {seconds:6.0f} s {success:6.1%}", flush=True)
                 if success >= SUCCESS or steps >= chosen["stop"]["env_steps"]:
                     break
-        write(runs, args.name, args.out)
+        write(args.out, "time_to_success", [asdict(each) for each in runs])
     for run in runs:
         steps, seconds = run.reached or run.curve[-1][:2]
         said = f"{SUCCESS:.0%} after" if run.reached else f"{run.curve[-1][2]:.0%} in the end,"
         print(
             f"{run.trainer}, seed {run.seed}: {said} {steps:,} steps, {seconds:.0f} s ({steps / seconds:,.0f} steps/s)"
         )
-
-
-def write(runs: list[Run], name: str, out: Path) -> None:
-    """Write what has been measured so far."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    (out / "time_to_success.json").write_text(json.dumps([asdict(run) for run in runs]) + "\n")
-    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
-    for run in runs:
-        _, seconds, success = zip(*run.curve, strict=True)
-        axes.plot(np.divide(seconds, 60.0), np.multiply(success, 100.0), label=f"{run.trainer}, seed {run.seed}")
-    axes.axhline(100.0 * SUCCESS, color="0.7", linewidth=1)
-    axes.set(xlabel="minutes", ylabel=f"success of the last {WINDOW} episodes [%]", title=f"PPO, {name}")
-    axes.legend()
-    figure.savefig(out / "time_to_success.png", dpi=110)
-    pyplot.close(figure)
 
 
 if __name__ == "__main__":

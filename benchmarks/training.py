@@ -6,15 +6,13 @@
 
 PPO as the UR5 script trains it: a batch of `--batch` steps, 4 epochs. A row is the median of `--iterations` iterations
 after one of warm-up. `--minutes` are divided among the configurations: one whose time is up keeps the iterations it has
-finished, or is recorded as failed, and the next one is measured. Table and plot (`bench/training.json`, `.png`) are
-written after each row. `vectorisation.py` compares ways to step several simulators in one process.
+finished, or is recorded as failed, and the next one is measured. `bench/training.json` is written after each row.
+`vectorisation.py` compares ways to step several simulators in one process.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 import os
 import signal
 import statistics
@@ -27,13 +25,12 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 
 import shared.training_run as training_run
+from measuring import parser, write
 
 from rlservo.export.contract.errors import RlservoError
 from rlservo.export.rllib.batched_connectors import use_batched_connectors
 
 UR5 = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"
-
-
 MINIBATCH = 512
 
 
@@ -53,21 +50,12 @@ class Iteration:
 
 
 @dataclass(frozen=True)
-class Row:
+class Row(Iteration):
     """A configuration's medians over its iterations."""
 
     runners: int
     envs: int
     iterations: int
-    steps_per_s: float
-    steps_per_cpu_s: float
-    iteration_s: float
-    sample_s: float
-    learn_s: float
-    rest_s: float
-    env_step_share: float
-    inference_share: float
-    connectors_share: float
 
 
 @dataclass(frozen=True)
@@ -84,23 +72,21 @@ class TimeUp(Exception):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--env", default=UR5)
-    parser.add_argument("--runners", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--envs", type=int, nargs="+", default=[1, 4, 16])
-    parser.add_argument("--iterations", type=int, help="default: 3; with --quick 2")
-    parser.add_argument("--batch", type=int, help="environment steps an iteration; default: 4096; with --quick 1024")
-    parser.add_argument("--minutes", type=float, help="for all of it; default: 15; with --quick 3")
-    parser.add_argument("--rllib-connectors", action="store_true", help="RLlib's own, to compare")
-    parser.add_argument("--quick", action="store_true", help="small batches")
-    parser.add_argument("--out", type=Path, default=Path("bench"))
-    args = parser.parse_args()
+    options = parser(__doc__)
+    options.add_argument("--env", default=UR5)
+    options.add_argument("--runners", type=int, nargs="+", default=[1, 2])
+    options.add_argument("--envs", type=int, nargs="+", default=[1, 4, 16])
+    options.add_argument("--iterations", type=int, help="default: 3; with --quick 2")
+    options.add_argument("--batch", type=int, help="environment steps an iteration; default: 4096; with --quick 1024")
+    options.add_argument("--minutes", type=float, help="for all of it; default: 15; with --quick 3")
+    options.add_argument("--rllib-connectors", action="store_true", help="RLlib's own, to compare")
+    options.add_argument("--quick", action="store_true", help="small batches")
+    args = options.parse_args()
     for name, default, quick in (("iterations", 3, 2), ("batch", 4096, 1024), ("minutes", 15.0, 3.0)):
         if getattr(args, name) is None:
             setattr(args, name, quick if args.quick else default)
     if min(*args.runners, *args.envs, args.iterations, args.minutes) <= 0 or args.batch < MINIBATCH:
-        parser.error(f"expected positive numbers, and a --batch of at least {MINIBATCH}")
-    args.out.mkdir(parents=True, exist_ok=True)
+        options.error(f"expected positive numbers, and a --batch of at least {MINIBATCH}")
     os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 would measure the machine's other work
     rows: list[Row | Failed] = []
     print(f"PPO on {args.env}, {args.batch:,} steps an iteration, median of {args.iterations}\n{HEADER}", flush=True)
@@ -113,8 +99,7 @@ def main() -> None:
             rllibs = args.rllib_connectors
             rows.append(measure(args.env, runners, envs, args.iterations, args.batch, limit, rllib_connectors=rllibs))
             print(line(rows[-1]), flush=True)
-            write(rows, args.env, args.batch, args.out)
-    print(f"written: {args.out / 'training.json'}, {args.out / 'training.png'}")
+            write(args.out, "training", document(rows, args.env, args.batch))
     if all(isinstance(row, Failed) for row in rows):
         raise RlservoError("no configuration finished an iteration in time: give more with --minutes")
 
@@ -180,8 +165,8 @@ def measure(
             return Failed(runners, envs, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
     if not taken:
         return Failed(runners, envs, f"no iteration ended within {limit:.3g} s")
-    medians = [statistics.median(getattr(one, name) for one in taken) for name in Iteration.__dataclass_fields__]
-    return Row(runners, envs, len(taken), *medians)
+    medians = {name: statistics.median(getattr(one, name) for one in taken) for name in Iteration.__dataclass_fields__}
+    return Row(**medians, runners=runners, envs=envs, iterations=len(taken))
 
 
 def configuration(env: str, runners: int, envs: int, batch: int, *, rllib_connectors: bool = False) -> Any:
@@ -256,36 +241,9 @@ def parts(result: dict[str, Any]) -> tuple[float, float, float]:
     return simulators, network, pipelines
 
 
-def write(rows: list[Row | Failed], env: str, batch: int, out: Path) -> None:
-    """Write what has been measured so far."""
-    document = {"env": env, "batch": batch, "rows": [asdict(row) for row in rows]}
-    (out / "training.json").write_text(json.dumps(document, indent=2) + "\n")
-    plot([row for row in rows if isinstance(row, Row)], env, out / "training.png")
-
-
-def plot(rows: list[Row], env: str, path: Path) -> None:
-    """Draw steps/s over environments per runner, a line per number of runners."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(7, 4), layout="constrained")
-    for runners in sorted({row.runners for row in rows}):
-        own = [row for row in rows if row.runners == runners]
-        label = f"{runners} env runner{'s' if runners > 1 else ''}"
-        axes.plot([row.envs for row in own], [row.steps_per_s for row in own], marker="o", label=label)
-    axes.set_xscale("log", base=2)
-    axes.set_xticks(numbers := sorted({row.envs for row in rows}), [str(number) for number in numbers])
-    axes.set(
-        xlabel="environments per env runner", ylabel="environment steps/s, learner included", title=f"PPO on {env}"
-    )
-    axes.set_ylim(bottom=0)
-    axes.grid(alpha=0.3)
-    if rows:
-        axes.legend()
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+def document(rows: list[Row | Failed], env: str, batch: int) -> dict[str, Any]:
+    """Return what has been measured so far."""
+    return {"env": env, "batch": batch, "rows": [asdict(row) for row in rows]}
 
 
 if __name__ == "__main__":

@@ -95,7 +95,7 @@ TESTS_OWN = (
     "benchmarks",
 )
 TRAINED_WITH = [
-    *(HERE.parent / name for name in ("benchmarks/training.py", "examples", *PRODUCT)),
+    *(HERE.parent / name for name in ("benchmarks/training.py", "benchmarks/measuring.py", "examples", *PRODUCT)),
     *(HERE / name for name in TESTS_OWN),
     versions("ray", "torch", "gymnasium", "numpy", "mujoco", "onnx", "onnxruntime"),
     str(EXAMPLES), str(OFFSCREEN),

@@ -9,12 +9,11 @@ and gives an action's, without a protocol around them.
 from __future__ import annotations
 
 import sys
-from typing import Any
 
 import numpy as np
-import onnxruntime
 import uvicorn
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
+from network import network
 from pydantic import BaseModel
 
 
@@ -27,24 +26,19 @@ class Reply(BaseModel):
 
 
 def build(onnx_file: str) -> FastAPI:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(onnx_file, options, providers=["CPUExecutionProvider"])
+    policy = network(onnx_file)
     app = FastAPI()
 
     @app.post("/act")
     async def act(request: Request) -> Reply:
-        outputs: list[Any] = list(session.run(["action"], {"obs": np.array([request.obs], np.float32)}))
-        return Reply(action=outputs[0][0].tolist())
+        return Reply(action=policy(request.obs).tolist())
 
     @app.websocket("/ws")
     async def stream(socket: WebSocket) -> None:
         await socket.accept()
         try:
             while True:
-                obs = np.frombuffer(await socket.receive_bytes(), np.float32)[None]
-                outputs: list[Any] = list(session.run(["action"], {"obs": obs}))
-                await socket.send_bytes(outputs[0].tobytes())
+                await socket.send_bytes(policy(np.frombuffer(await socket.receive_bytes(), np.float32)).tobytes())
         except WebSocketDisconnect:
             pass
 

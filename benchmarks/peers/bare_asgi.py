@@ -14,24 +14,21 @@ import sys
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import orjson
 import uvicorn
+from network import network
 
 
 def build(onnx_file: str) -> Any:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(onnx_file, options, providers=["CPUExecutionProvider"])
+    act = network(onnx_file)
 
     async def app(scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] == "websocket":
             await receive()
             await send({"type": "websocket.accept"})
             while (message := await receive())["type"] == "websocket.receive":
-                obs = np.frombuffer(message["bytes"], np.float32)[None]
-                streamed: Any = session.run(["action"], {"obs": obs})
-                await send({"type": "websocket.send", "bytes": streamed[0].tobytes()})
+                action = act(np.frombuffer(message["bytes"], np.float32))
+                await send({"type": "websocket.send", "bytes": action.tobytes()})
             return
         if scope["type"] == "lifespan":  # Ray Serve's
             for event in ("startup", "shutdown"):
@@ -43,9 +40,7 @@ def build(onnx_file: str) -> Any:
             message = await receive()
             body += message.get("body", b"")
             more = message.get("more_body", False)
-        obs = np.asarray(orjson.loads(body)["obs"], np.float32)[None]
-        outputs: Any = session.run(["action"], {"obs": obs})
-        content = orjson.dumps({"action": outputs[0][0]}, option=orjson.OPT_SERIALIZE_NUMPY)
+        content = orjson.dumps({"action": act(orjson.loads(body)["obs"])}, option=orjson.OPT_SERIALIZE_NUMPY)
         headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content))]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": content})

@@ -14,24 +14,21 @@ import sys
 from typing import Any
 
 import litserve
-import numpy as np
-import onnxruntime
+from network import network
 
 
 class PolicyAPI(litserve.LitAPI):  # type: ignore[misc]  # its base class is not in the type checker's environment
     def setup(self, device: str) -> None:  # noqa: ARG002  # LitServe's interface
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(sys.argv[2], options, providers=["CPUExecutionProvider"])
+        self._act = network(sys.argv[2])
 
     def decode_request(self, request):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201  # LitServe reads annotations
-        return np.array([request["obs"]], np.float32)
+        return request["obs"]
 
     def predict(self, obs: Any) -> Any:
-        return self._session.run(["action"], {"obs": obs})[0]
+        return self._act(obs)
 
     def encode_response(self, action: Any) -> dict[str, Any]:
-        return {"action": action[0].tolist()}
+        return {"action": action.tolist()}
 
 
 if __name__ == "__main__":

@@ -14,26 +14,20 @@ from __future__ import annotations
 import asyncio
 import sys
 
-import numpy as np
-import onnxruntime
 from mlserver import MLModel, MLServer, ModelSettings, Settings
 from mlserver.codecs import NumpyCodec
 from mlserver.settings import ModelParameters
 from mlserver.types import InferenceRequest, InferenceResponse
+from network import network
 
 
 class PolicyRuntime(MLModel):  # type: ignore[misc]  # its base class is not in the type checker's environment
     async def load(self) -> bool:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(
-            self.settings.parameters.uri, options, providers=["CPUExecutionProvider"]
-        )
+        self._act = network(self.settings.parameters.uri)
         return True
 
     async def predict(self, payload: InferenceRequest) -> InferenceResponse:
-        obs = NumpyCodec.decode_input(payload.inputs[0]).astype(np.float32, copy=False)
-        action = self._session.run(["action"], {"obs": obs})[0]
+        action = self._act(NumpyCodec.decode_input(payload.inputs[0])[0])[None]
         return InferenceResponse(model_name=self.name, outputs=[NumpyCodec.encode_output("action", action)])
 
 

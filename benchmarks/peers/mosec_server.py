@@ -11,25 +11,18 @@ from __future__ import annotations
 import os
 from typing import Any
 
-import numpy as np
-import onnxruntime
 from mosec import Server, Worker
+from network import network
 
 
 class PolicyWorker(Worker):  # type: ignore[misc]
     """Answers with the policy's action."""
 
     def __init__(self) -> None:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(
-            os.environ["POLICY_ONNX"], options, providers=["CPUExecutionProvider"]
-        )
+        self._act = network(os.environ["POLICY_ONNX"])
 
     def forward(self, data: Any) -> dict[str, Any]:
-        obs = np.asarray(data["obs"], np.float32)[None]
-        outputs: Any = self._session.run(["action"], {"obs": obs})
-        return {"action": outputs[0][0].tolist()}
+        return {"action": self._act(data["obs"]).tolist()}
 
 
 if __name__ == "__main__":

@@ -9,23 +9,19 @@ import json
 import sys
 from typing import Any
 
-import numpy as np
-import onnxruntime
+from network import network
 
 port, onnx_file = int(sys.argv[1]), sys.argv[2]
 sys.argv[1:] = ["--log-level", "ERROR"]  # Robyn reads the command line itself
 from robyn import Response, Robyn  # noqa: E402
 
-options = onnxruntime.SessionOptions()
-options.intra_op_num_threads = 1
-session = onnxruntime.InferenceSession(onnx_file, options, providers=["CPUExecutionProvider"])
+policy = network(onnx_file)
 app = Robyn(__file__)
 
 
 @app.post("/act")  # type: ignore[untyped-decorator]  # as above
 async def act(request: Any) -> Any:
-    outputs: Any = session.run(["action"], {"obs": np.asarray([json.loads(request.body)["obs"]], np.float32)})
-    content = json.dumps({"action": outputs[0][0].tolist()})
+    content = json.dumps({"action": policy(json.loads(request.body)["obs"]).tolist()})
     return Response(status_code=200, headers={"content-type": "application/json"}, description=content)
 
 

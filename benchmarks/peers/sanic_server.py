@@ -8,20 +8,16 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-import numpy as np
-import onnxruntime
+from network import network
 from sanic import Sanic, json
 
-options = onnxruntime.SessionOptions()
-options.intra_op_num_threads = 1
-session = onnxruntime.InferenceSession(sys.argv[2], options, providers=["CPUExecutionProvider"])
+policy = network(sys.argv[2])
 app = Sanic("policy")
 
 
 @app.post("/act")  # type: ignore[untyped-decorator]  # as above
 async def act(request: Any) -> Any:
-    outputs: Any = session.run(["action"], {"obs": np.asarray([request.json["obs"]], np.float32)})
-    return json({"action": outputs[0][0].tolist()})
+    return json({"action": policy(request.json["obs"]).tolist()})
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from rlservo.envs.robots.command_stream import Order, Phase
 from rlservo.envs.robots.limits import CheckedLimits
 from rlservo.envs.robots.link_delay import LinkDelay
 from rlservo.envs.ros2.address import BASE_OPTIONS, RosAddress
-from rlservo.envs.ros2.link import FIRST_MESSAGES_S, Endpoint, check_clock, open_link, take_command, wait_until
+from rlservo.envs.ros2.link import check_clock, open_link, take_command, wait_for
 from rlservo.envs.ros2.messages import (
     FLAG,
     LASER_SCAN,
@@ -51,7 +51,7 @@ RATE_HZ = 20.0
 AGE_BOUND_S = 0.3  # [s] oldest input that may be acted on: scans come at 12.5 Hz, or 10
 LOST_S = 2.0  # [s] without odometry, after which the connection counts as lost
 DEADMAN_S = 0.5  # [s], oldest dead-man message
-SCALES = (1.0, 0.75, 0.5, 0.25)  # of a velocity, tried in order if something is in the way
+SCALES = (1.0, 0.75, 0.5, 0.25, 0.0)  # of a velocity, tried in order until nothing is in the way
 INSTANTS = 5  # points checked on the path to a standstill
 
 Vector = NDArray[np.float64]
@@ -138,7 +138,7 @@ class RosBase:
                 self._subscribe_scan(topic, pose)
             if address["deadman"]:
                 link.subscribe(address["deadman"], FLAG, self._take_deadman)
-            wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
+            wait_for(lambda: not self._missing(), self._missing)
             for topic, one in self._inputs.items():
                 check_clock(topic, one.age_s)
             self._is_stamped = self._find_twist() == TWIST_STAMPED
@@ -195,19 +195,15 @@ class RosBase:
             address["front_scan"]: scanner_pose(FRONT_SCANNER),
             address["back_scan"]: scanner_pose(BACK_SCANNER),
         }
-        found: dict[str, tuple[float, float, float]] = {}
 
-        def look() -> bool:
+        def look() -> dict[str, tuple[float, float, float]]:
             single = address["scan"] or "/scan"
             if not address["scan"] and all(self._link.publishers(topic) for topic in both):
-                found.update(both)
-            elif self._link.publishers(single):
-                found[single] = (0.0, 0.0, 0.0)
-            return bool(found)
+                return both
+            return {single: (0.0, 0.0, 0.0)} if self._link.publishers(single) else {}
 
         names = address["scan"] or f"{' and '.join(both)}, or /scan"
-        wait_until(look, f"nothing publishes {names} (limit stop_distance=0 works without it)", FIRST_MESSAGES_S)
-        return found
+        return wait_for(look, f"nothing publishes {names} (limit stop_distance=0 works without it)")
 
     def _subscribe_scan(self, topic: str, pose: tuple[float, float, float]) -> None:
         one = self._inputs[topic]
@@ -216,12 +212,9 @@ class RosBase:
     def _take_deadman(self, message: Any) -> None:
         self._deadman = (time.monotonic(), bool(message.data))
 
-    def _is_complete(self) -> bool:
-        return all(one.value is not None for one in self._inputs.values())
-
     def _missing(self) -> str:
         missing = [topic for topic, one in self._inputs.items() if one.value is None]
-        return f"no message with a stamp on {', '.join(missing)}: is the base's driver running"
+        return f"no message with a stamp on {', '.join(missing)}: is the base's driver running" if missing else ""
 
     def _find_twist(self) -> str:
         """Return the message type of the command topic: as set, or as its subscribers use it."""
@@ -229,13 +222,8 @@ class RosBase:
         if said != "auto":
             return TWIST_STAMPED if said == "TwistStamped" else TWIST
         topic = self.address["cmd_vel"]
-        found: list[Endpoint] = []
-
-        def look() -> bool:
-            found[:] = self._link.subscribers(topic)
-            return bool(found)
-
-        wait_until(look, f"nothing subscribes to {topic}: is the base's driver running", FIRST_MESSAGES_S)
+        nothing = f"nothing subscribes to {topic}: is the base's driver running"
+        found = wait_for(lambda: self._link.subscribers(topic), nothing)
         kinds = {one.type for one in found} & {TWIST, TWIST_STAMPED}
         if len(kinds) != 1:
             types = ", ".join(sorted({one.type for one in found}))
@@ -270,13 +258,9 @@ class RosBase:
             self._counts[f"acceleration.{name}"] += abs(wanted - now) > 2.0 * most
             changed.append(now + step)
         linear, angular = changed
-        if self._is_clear(linear, angular):
-            return linear, angular
-        self._counts["stop_distance"] += 1
-        for scale in SCALES[1:]:
-            if self._is_clear(linear * scale, angular * scale):
-                return linear * scale, angular * scale
-        return 0.0, 0.0
+        scale = next(one for one in SCALES if self._is_clear(linear * one, angular * one))
+        self._counts["stop_distance"] += scale < 1.0
+        return linear * scale, angular * scale
 
     def _wanted(self) -> Twist2:
         now = time.monotonic()

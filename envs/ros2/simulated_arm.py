@@ -16,7 +16,6 @@ from rlservo.envs.ros2.rclpy_link import RclpyLink, message_class
 from rlservo.envs.ros2.simulation_loop import FaultyLink
 from rlservo.envs.ur_controller.console import obey
 from rlservo.envs.ur_controller.controller import Controller, RobotMode, SafetyMode
-from rlservo.envs.ur_controller.server import Link as LinkFaults
 
 LOOKAHEAD_S = 0.1  # with the driver's own 0.03 s, every pause of a machine that is not real-time becomes a jump
 VELOCITY_ACCELERATION = 25.0  # [rad/s^2], of speedj for velocity commands
@@ -32,11 +31,11 @@ log = logging.getLogger("rlservo.robot")
 class SimulatedArm:
     """The arm with one active controller: position, velocity or trajectory."""
 
-    def __init__(self, ur_model: str, *, controller: str, prefix: str, faults: LinkFaults) -> None:
+    def __init__(self, ur_model: str, *, controller: str, prefix: str) -> None:
         """Join the graph. Raises RobotError without rclpy, ValueError for an unknown model."""
         self.controller = Controller(ur_model)
-        self.link = faults
-        self.messages = FaultyLink(faults)
+        self.messages = FaultyLink()
+        self.link = self.messages.faults
         self.dt = self.controller.dt
         self._joints = [prefix + JOINT_NAMES[name] for name in JOINT_NAMES]
         self._order = [list(JOINT_NAMES).index(name) for name in PUBLISHED_ORDER]
@@ -86,9 +85,9 @@ class SimulatedArm:
         if controller.time_s >= self._status_due_s:
             self._status_due_s = controller.time_s + STATUS_PERIOD_S
             self._publish["speed_scaling"]({"data": 100.0 * controller.speed_fraction})
-            self._publish["program_running"]({"data": self._has_program})
             self._publish["robot_mode"]({self._mode_field: int(controller.robot_mode)})
             self._publish["safety_mode"]({self._mode_field: int(controller.safety_mode)})
+            self._publish["program_running"]({"data": self._has_program})
 
     def obey(self, line: str) -> str:
         """Carry out a line of the controller's console."""

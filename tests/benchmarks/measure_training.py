@@ -7,10 +7,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
+import measuring
 import training
 
 training.warm_up()
 rows = [training.measure("CartPole-v1", 1, 4, 1, 512, limit) for limit in (0.5, 200.0)]
 for row in rows:
     print(training.line(row))
-training.write(rows, "CartPole-v1", 512, Path())
+measuring.write(Path(), "training", training.document(rows, "CartPole-v1", 512))

@@ -109,6 +109,28 @@ def test_state_that_the_link_delivers_late_is_not_acted_on(arm: RunningArm) -> N
         assert arm.controller.is_program_running
 
 
+def test_reset_while_the_speed_blends_in_returns_to_the_start_and_blends_in_again(arm: RunningArm) -> None:
+    blend_s = 2.0
+    with real_env(arm, limits={**LIMITS, "blend_s": blend_s}, max_velocity_scale_factor=0.5) as env:
+        env.reset(options={"joint_positions": START})
+        action = np.array([0.2, -0.4, 0.5, 0.0, -0.2], dtype=np.float32)
+        began = time.monotonic()
+        while time.monotonic() - began < blend_s / 2.0:
+            _, _, _, _, info = env.step(action)
+        assert info["robot"]["state"] != "run"
+        assert abs(arm.controller.simulation.joint_positions - START).max() > 0.1
+
+        began = time.monotonic()
+        env.reset(options={"joint_positions": START})
+        assert abs(arm.controller.simulation.joint_positions - START).max() < 0.03
+        _, _, _, _, info = env.step(action)
+        assert [change["state"] for change in info["robot"]["changes"]][:3] == ["go_to_start", "ready", "blend_in"]
+        while info["robot"]["state"] != "run":
+            _, _, _, _, info = env.step(action)
+            assert time.monotonic() - began < PATIENCE_S
+        assert time.monotonic() - began >= blend_s
+
+
 def test_protective_stop_ends_the_episode_and_the_next_reset_says_what_to_do(arm: RunningArm) -> None:
     with real_env(arm) as env:
         env.reset(seed=1)
