@@ -51,6 +51,11 @@ class Episode:
     truncated: bool = False  # whether it was cut off, as by a time limit
     last_action: Any = None  # the robot's last command, if the step from it is limited
 
+    @property
+    def begins(self) -> bool:
+        """Whether it is the episode's first request."""
+        return self.reset or (self.state is not None and not self.state)
+
 
 EPISODE_FIELDS = frozenset(each.name for each in fields(Episode))
 

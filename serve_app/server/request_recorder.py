@@ -145,8 +145,9 @@ class RequestRecorder:
             arrays = known.observations.arrays(request.obs)
         except Exception:  # it may be anything: it has not been checked yet
             return
-        episode = "" if _carries_state(request) else _episode_of(request)
-        step = self._count(policy.contract.name, episode, said.reset) if episode else 0
+        carries_state = policy.is_stateful and said.state is not None
+        episode = "" if carries_state else _episode_of(request)
+        step = self._count(policy.contract.name, episode, said.begins) if episode else 0
         record = DecisionRecord(
             known, LeafArrays({name: array.copy() for name, array in arrays.items()}), None, episode, step, taken_ms,
             request.explore, seq=request.seq, request_id=_request_id(request), error=code,
@@ -163,7 +164,7 @@ class RequestRecorder:
             return "", 0
         # A memory that continues does not begin an episode, even if its end was reported or it was forgotten here.
         least = note.step - 1 if note is not None and note.step is not None and decision.policy.is_stateful else 0
-        step = self._count(decision.name, episode, said.reset, least)
+        step = self._count(decision.name, episode, said.begins, least)
         if said.end or said.final_status is not None:
             del self._steps[decision.name, episode]
         return episode, step
@@ -209,7 +210,3 @@ def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:
     except RequestError:
         return None
     return numbers if len(numbers) in (1, rows) and np.isfinite(numbers).all() else None
-
-
-def _carries_state(request: Request) -> bool:
-    return request.episode is not None and request.episode.state is not None
