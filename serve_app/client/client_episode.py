@@ -25,8 +25,8 @@ class ClientEpisode:
     def __init__(self, *, server_state: bool, is_stream: bool) -> None:
         self._server_state = server_state
         self._is_stream = is_stream
-        self._session_id = uuid.uuid4().hex if server_state and not is_stream else None
-        self._has_unanswered_start = False  # this request may reach the server after the next one
+        self._session_id = ""
+        self._is_id_spent = True  # a request with it may reach the server after the next one
         self.reset()
 
     def reset(self) -> None:
@@ -66,10 +66,10 @@ class ClientEpisode:
             if self._is_lost:
                 raise SessionLostError("the connection broke and the episode's memory was lost: call reset()")
             fields["reset"] = self._steps == 0
-            if self._session_id is not None:
-                if self._has_unanswered_start:
+            if not self._is_stream:
+                if self._is_id_spent:
                     self._session_id = uuid.uuid4().hex
-                self._has_unanswered_start = self._steps == 0
+                self._is_id_spent = self._steps == 0
                 fields["session_id"] = self._session_id
                 fields |= {"end": True} if ends else {}
         elif self._state is not None:
@@ -83,15 +83,14 @@ class ClientEpisode:
     def end(self) -> None:
         """Note that the server knows the episode's end: the next episode gets its own session."""
         self.reset()
-        if self._session_id is not None:
-            self._session_id = uuid.uuid4().hex
+        self._is_id_spent = True
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
         """Advance to the next step after a reply; `action` is the reply's.
 
         Raises SessionLostError when the reply belongs to another episode, UnavailableError when it lacks the state.
         """
-        self._has_unanswered_start = False
+        self._is_id_spent = False
         if not self._is_on_server(contract):
             self._state = next_state(reply, contract)
             self._steps += 1

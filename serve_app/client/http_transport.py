@@ -13,15 +13,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote, urlsplit
 
+import httpcore
 import numpy as np
+import orjson
 
 from rlservo.export.contract.errors import DeadlineError, TooLargeError, UnavailableError, UsageError
-from rlservo.export.contract.extras import needs_extra
-
-with needs_extra("client", what="the HTTP client"):
-    import httpcore
-    import orjson
-
 from rlservo.serve_app.client.replies import decode_error, excerpt
 from rlservo.serve_app.wire.addresses import parse_address
 from rlservo.serve_app.wire.bounded_http import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool, time_left
@@ -93,13 +89,13 @@ class Transport:
         """Number of connections after the first."""
         return max(0, self._backend.connections - 1)
 
-    def get(self, *path: str, timeout_s: float | None = None, retries: int | None = None) -> Any:
+    def get(self, *path: str, timeout_s: float | None = None) -> Any:
         """Return the JSON at `/path[0]/path[1]/...`."""
-        return self._parse(self._call("GET", path, None, timeout_s, retries))
+        return self._parse(self._call("GET", path, None, timeout_s))
 
     def get_bytes(self, *path: str, timeout_s: float | None = None) -> bytes:
         """Return the content at `/path[0]/path[1]/...`."""
-        return self._call("GET", path, None, timeout_s, None)
+        return self._call("GET", path, None, timeout_s)
 
     def post(self, *path: str, document: Mapping[str, Any], timeout_s: float | None = None) -> Any:
         """Send a document as JSON and return the JSON answer.
@@ -107,16 +103,14 @@ class Transport:
         numpy arrays become nested lists of numbers that are exact to the bit when read.
         """
         body = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY, default=np.ndarray.tolist)
-        return self._parse(self._call("POST", path, body, timeout_s, None))
+        return self._parse(self._call("POST", path, body, timeout_s))
 
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
         self._is_closed = True
         self._pool.close()
 
-    def _call(
-        self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None, retries: int | None
-    ) -> bytes:
+    def _call(self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None) -> bytes:
         """Try until there is an answer, no time or no retry left; return the content.
 
         Raises DeadlineError if the answer did not come in time (never retried: the server may still be working),
@@ -128,7 +122,6 @@ class Transport:
         if body is not None:
             headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
         deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
-        retries = self._retries if retries is None else retries
         attempt = 0
         while True:
             # Jitter keeps a fleet of robots from retrying at once.
@@ -149,9 +142,11 @@ class Transport:
                 failure.retry_after_s = _retry_after_s(response.headers)
                 wait = wait if failure.retry_after_s is None else failure.retry_after_s
             # A wait beyond the caller's budget is useless: report the failure now.
-            if attempt == retries or time.monotonic() + wait >= deadline:
+            if attempt == self._retries or time.monotonic() + wait >= deadline:
                 raise failure
             time.sleep(wait)
+            if time.monotonic() >= deadline:
+                raise failure
             attempt += 1
 
     def exchange(

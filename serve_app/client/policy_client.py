@@ -35,11 +35,6 @@ class PolicyClient(RemotePolicy):
     With `label`, the server's recording names its requests between two `reset`s as one episode of that label.
     """
 
-    @property
-    def reconnects(self) -> int:
-        """Number of connections after the first."""
-        return self._transport.reconnects
-
     def reset(self) -> None:
         """Start an episode: the next request carries it. Sends nothing."""
         super().reset()

@@ -106,6 +106,11 @@ class RemotePolicy(ActingPolicy):
         self._recording = None if record is None else record_policy(self, record, act=self._act)
 
     @property
+    def reconnects(self) -> int:
+        """Number of connections after the first."""
+        return self._transport.reconnects
+
+    @property
     def contract(self) -> Contract:
         """The contract of the version that answered last or, before the first answer, of the server's default.
 
@@ -181,8 +186,7 @@ class RemotePolicy(ActingPolicy):
         self._episode.reset()
         self._reward = None
         # A version number needs no lookup.
-        known = self._contract
-        self._looks_up = self._version is not None and known is not None and self._version != known.version
+        self._looks_up = self._version not in (None, self._contract and self._contract.version)
         if self._recording is not None:
             self._recording.begin()
 
@@ -190,6 +194,7 @@ class RemotePolicy(ActingPolicy):
         """End the recording and close the connections to the server; later calls raise UsageError."""
         if self._recording is not None:
             self._recording.end()
+        self._disconnect()
         self._transport.close()
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
@@ -228,7 +233,9 @@ class RemotePolicy(ActingPolicy):
             return self._send(request, batch, deadline)
         except StateNeededError:
             # Another version answers now; or the step from one action to the next is limited, which no contract says.
-            self._remember(deadline)
+            self._episode.carry()
+            self._disconnect()  # only a new stream has a memory
+            self._meet(self._fetch_contract(self._version, max(deadline - time.monotonic(), 0.001)))
             return self._send(request, batch, deadline)
 
     @abstractmethod
@@ -236,22 +243,20 @@ class RemotePolicy(ActingPolicy):
         """Send a request once with the episode's fields, and return the reply."""
         ...
 
-    def _remember(self, deadline: float) -> None:  # noqa: ARG002
-        """Begin a memory for a version that needs one."""
-        self._episode.carry()
+    def _disconnect(self) -> None:
+        """End the stream, if there is one."""
 
     def _renew_label(self) -> None:
         number = secrets.token_hex(8 if self._label is None else 4)
         self._transport.label = number if self._label is None else f"{self._label}.{number}"
 
     def _fetch_contract(self, version: str | None, timeout_s: float | None) -> Contract:
-        """Request a contract: once if there is a time-out, otherwise with the client's usual retries."""
-        retries = None if timeout_s is None else 0
+        """Request a contract, by default with the client's usual time-out."""
         name = self._name or (self._contract.name if self._contract else None)
         if name is None:
-            name = _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s, retries=retries))
+            name = _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s))
         path = ("v1", "policies", name, *(() if version is None else ("versions", version)))
-        document = self._transport.get(*path, timeout_s=timeout_s, retries=retries)
+        document = self._transport.get(*path, timeout_s=timeout_s)
         try:
             return Contract.model_validate(document)
         except ValidationError as error:

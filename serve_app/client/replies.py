@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import orjson
 
 from rlservo.export.contract import errors
 from rlservo.export.contract.contract import REWARD, Contract
@@ -20,13 +21,9 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.export.contract.extras import needs_extra
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.wire.request_names import MARK
-
-with needs_extra("client", what="the HTTP client"):
-    import orjson
 
 CLASSES = {
     kind.code: kind

@@ -10,17 +10,15 @@ import time
 from typing import Any
 from urllib.parse import quote
 
+import orjson
+
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import DeadlineError, RlservoError, UnavailableError
-from rlservo.export.contract.extras import needs_extra
 from rlservo.serve_app.client.http_transport import BrokenError
 from rlservo.serve_app.client.remote_policy import RemotePolicy
 from rlservo.serve_app.client.replies import error_of
 from rlservo.serve_app.client.websocket_connection import WebSocket
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
-
-with needs_extra("client", what="the WebSocket client"):
-    import orjson
 
 SCHEMES = {"http": "ws", "https": "wss", "ws": "ws", "wss": "wss"}
 WAIT_S = 0.02  # between two attempts to connect within one call
@@ -44,20 +42,9 @@ class StreamClient(RemotePolicy):
     _is_stream = True
     _schemes = SCHEMES
     _socket: WebSocket | None = None
-    _path = ""  # of the last connection
-    _connections = 0
+    _address: tuple[str, str | None] = ("", None)  # policy and version of the last connection
     stale = 0
     """Answers that came after their deadline and were dropped."""
-
-    @property
-    def reconnects(self) -> int:
-        """Number of connections after the first."""
-        return max(0, self._connections - 1)
-
-    def close(self) -> None:
-        """Close the connection, as `RemotePolicy.close`."""
-        self._disconnect()
-        super().close()
 
     def _send(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float) -> Any:
         while True:
@@ -70,7 +57,7 @@ class StreamClient(RemotePolicy):
             except BrokenError:
                 wait_s = WAIT_S if self._socket is None else 0.0
                 self._disconnect()
-                if time.monotonic() + WAIT_S >= deadline:
+                if time.monotonic() + wait_s + WAIT_S >= deadline:
                     raise  # before that, asking twice is harmless: the server has not kept any memory of ours
                 time.sleep(wait_s)
             except DeadlineError:
@@ -101,18 +88,18 @@ class StreamClient(RemotePolicy):
 
     def _connected(self, contract: Contract, deadline: float) -> WebSocket:
         """Return the connection to a policy, or to the version that was named."""
-        version = "" if self._version is None else f"/versions/{quote(contract.version, safe='')}"
-        path = f"/v1/policies/{quote(contract.name, safe='')}{version}/stream?errors=keep"
-        if path != self._path:
+        address = (contract.name, None if self._version is None else contract.version)
+        if address != self._address:
             self._disconnect()
         if self._socket is None:
-            self._socket, self._path = WebSocket(self._transport, path, deadline), path
+            which = "" if self._version is None else f"/versions/{quote(contract.version, safe='')}"
+            path = f"/v1/policies/{quote(contract.name, safe='')}{which}/stream?errors=keep"
+            self._socket, self._address = WebSocket(self._transport, path, deadline), address
             try:
                 self._receive(self._socket, 0, deadline)  # the metadata
             except BaseException:
                 self._disconnect()
                 raise
-            self._connections += 1
             self._episode.reconnect()
         return self._socket
 
@@ -122,11 +109,6 @@ class StreamClient(RemotePolicy):
         contract = super()._fetch_contract(version, timeout_s)
         self._connected(contract, deadline)
         return contract
-
-    def _remember(self, deadline: float) -> None:
-        super()._remember(deadline)
-        self._disconnect()  # only a new connection has a memory
-        self._meet(self._fetch_contract(self._version, max(deadline - time.monotonic(), 0.001)))
 
     def _disconnect(self) -> None:
         if self._socket is not None:

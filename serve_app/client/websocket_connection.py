@@ -10,16 +10,14 @@ import contextlib
 import socket
 import time
 
+from websockets.client import ClientProtocol
+from websockets.frames import Frame, Opcode
+from websockets.uri import parse_uri
+
 from rlservo.export.contract.errors import DeadlineError
-from rlservo.export.contract.extras import needs_extra
 from rlservo.serve_app.client.http_transport import BrokenError, Transport
 from rlservo.serve_app.client.replies import decode_error
 from rlservo.serve_app.wire.bounded_http import send_all, time_left
-
-with needs_extra("client", what="the WebSocket client"):
-    from websockets.client import ClientProtocol
-    from websockets.frames import Frame, Opcode
-    from websockets.uri import parse_uri
 
 MAX_FRAME_BYTES = 64 << 20  # larger than any action or contract
 RECEIVE_BYTES = 65536

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
 from rlservo.serve_app.episodes.carried_state import carry, parse_state, split_identity
 from rlservo.serve_app.episodes.memory_sessions import MemorySessions, shorten
-from rlservo.serve_app.episodes.request import Episode, Request, SessionId, new_episode_id
+from rlservo.serve_app.episodes.request import Request, SessionId, new_episode_id
 from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
@@ -67,22 +67,21 @@ class Episodes:
         `Policy.step` raises; the recurrent state has then not changed.
         """
         episode = request.episode
-        if episode is not None:
-            if episode.final_status is not None and episode.begins:
-                raise RequestError(
-                    "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): "
-                    "report how the last one ended in a separate request before it"
-                )
-            if episode.session_id is not None:
-                request.label = str(episode.session_id)
-                if store.remembers(request.policy):
-                    return await self._act_in_session(store, request, episode, episode.session_id)
-                # There is nothing to remember: the id only groups requests.
-            elif episode.end or (episode.reset and request.stream_id is None):
-                word = "end" if episode.end else "reset"
-                raise RequestError(f"'{word}' needs a session: also send its 'session_id'")
-            if episode.state is not None:
-                return self._act_from_carried(store, request, episode.state)
+        if episode.final_status is not None and episode.begins:
+            raise RequestError(
+                "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): "
+                "report how the last one ended in a separate request before it"
+            )
+        if episode.session_id is not None:
+            request.label = str(episode.session_id)
+            if store.remembers(request.policy):
+                return await self._act_in_session(store, request, episode.session_id)
+            # There is nothing to remember: the id only groups requests.
+        elif episode.end or (episode.reset and request.stream_id is None):
+            word = "end" if episode.end else "reset"
+            raise RequestError(f"'{word}' needs a session: also send its 'session_id'")
+        if episode.state is not None:
+            return self._act_from_carried(store, request, episode.state)
         if request.stream is not None:
             return self._act_on_stream(store, request, request.stream)
         return _act_alone(store, request)
@@ -129,7 +128,7 @@ class Episodes:
     def _act_on_stream(self, store: PolicyStore, request: Request, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
         before = stream
-        if request.episode is not None and request.episode.reset:
+        if request.episode.reset:
             before = Session(_choose(store, request))
         else:
             _check_version(store, request, stream.policy, "this stream's episode")
@@ -140,21 +139,18 @@ class Episodes:
         decision.episode = EpisodeNote(step=stream.steps)
         return decision
 
-    async def _act_in_session(
-        self, store: PolicyStore, request: Request, episode: Episode, session_id: SessionId
-    ) -> Decision:
+    async def _act_in_session(self, store: PolicyStore, request: Request, session_id: SessionId) -> Decision:
         """Act from the state stored under the request's id."""
-        name = request.policy
-        if episode.state is not None:
+        if request.episode.state is not None:
             raise RequestError("the request has both 'state' and 'session_id': send one of them")
         if not self._has_sessions:
             raise RequestError(NO_SHARED_SESSIONS)
         try:
             decision = await (self.store or self.sessions).act(store, request, session_id, self._step_session)
         except SessionLostError:
-            self.lost[name] += 1
+            self.lost[request.policy] += 1
             raise
-        self.begun[name] += episode.reset
+        self.begun[request.policy] += request.episode.reset
         return decision
 
     def _step_session(self, store: PolicyStore, request: Request, session: Session | None) -> tuple[Decision, Session]:
@@ -163,7 +159,7 @@ class Episodes:
         If the last request is repeated, the session has already answered it, and is returned unchanged.
         """
         episode, seq = request.episode, request.seq
-        assert episode is not None and episode.session_id is not None
+        assert episode.session_id is not None
         if episode.reset:
             session = Session(_choose(store, request))
         else:
@@ -182,19 +178,12 @@ class Episodes:
             if session.is_ended:
                 raise self._lost(request, episode.session_id)
         decision, step = _take_step(session.policy, request, before=session.state, last=session.last)
+        inputs_hash = b"" if seq is None else session.policy.fingerprint(step.inputs)
         after = replace(
-            session,
-            state=step.state or None,
-            last=step.leaves,
-            steps=session.steps + 1,
-            rows=step.rows,
-            is_ended=episode.end,
-            seq=seq,
-            inputs_hash=b"" if seq is None else session.policy.fingerprint(step.inputs),
-            infer_ms=decision.infer_ms,
-            batch=decision.batch,
+            session, state=step.state or None, last=step.leaves, steps=session.steps + 1, rows=step.rows,
+            is_ended=episode.end, seq=seq, inputs_hash=inputs_hash, infer_ms=decision.infer_ms, batch=decision.batch,
             notices=decision.notices,
-        )
+        )  # fmt: skip
         decision.episode = EpisodeNote(session_id=episode.session_id, step=after.steps)
         return decision, after
 
@@ -205,9 +194,6 @@ class Episodes:
             f"was idle for {self._idle_s:g} s, or was lost with its process, store or version: begin an episode",
             {"session_id": shown, "policy": request.policy[:64]},
         )
-
-
-NO_EPISODE = Episode()
 
 
 def _act_alone(store: PolicyStore, request: Request) -> Decision:
@@ -226,8 +212,7 @@ def _choose(store: PolicyStore, request: Request) -> Policy:
 
 def _check_last_action(policy: Policy, request: Request, last_action: Any) -> None:
     """Raise StateNeededError if a limited step has no last action to count from."""
-    episode = request.episode or NO_EPISODE
-    if policy.has_step_limit and last_action is None and episode.last_action is None:
+    if policy.has_step_limit and last_action is None and request.episode.last_action is None:
         raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
 
 
@@ -259,7 +244,7 @@ def _check_version(store: PolicyStore, request: Request, policy: Policy, memory:
 
 def _take_step(policy: Policy, request: Request, *, last_action: Any = None, **memory: Any) -> tuple[Decision, Step]:
     """Take a step from `memory`, as `Policy.step` takes it; a last action in the request precedes `last_action`."""
-    episode = request.episode or NO_EPISODE
+    episode = request.episode
     return take_step(
         policy,
         request.obs,

@@ -108,7 +108,7 @@ class MemorySessions:
 def overtaken(request: Request, session_id: SessionId) -> RlservoError:
     """Return the error for a request whose session was begun again meanwhile."""
     shown = f"session '{shorten(session_id)}' of policy '{request.policy[:64]}'"
-    if request.episode is not None and request.episode.reset:
+    if request.episode.reset:
         return UnavailableError(f"another request started {shown} at the same time: try again")
     return SessionError(f"the request belongs to an earlier episode: another one has restarted {shown} since")
 

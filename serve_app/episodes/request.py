@@ -58,6 +58,8 @@ class Episode:
 
 
 EPISODE_FIELDS = frozenset(each.name for each in fields(Episode))
+NO_EPISODE = Episode()
+"""Of a request with none of its fields."""
 
 
 @dataclass(slots=True)
@@ -108,7 +110,7 @@ class Request:
     """[ms] After `received`; a request that is late by then is not computed."""
     timestamp: float | None = None
     """[s] The client's clock, echoed in the reply."""
-    episode: Episode | None = None
+    episode: Episode = NO_EPISODE
     non_finite: bool = False
     """Whether its JSON held NaN or Infinity, which JSON does not have."""
     reply_options: Any = None

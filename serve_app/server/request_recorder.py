@@ -40,7 +40,6 @@ logger = logging.getLogger(__name__)
 
 MOST_EPISODES = 65_536  # whose steps are counted; beyond it, the one that was silent longest starts over
 LONGEST_REQUEST_ID = 128  # longer ones are cut: a header may have 16 KB
-NO_EPISODE = Episode()
 
 
 class RequestRecorder:
@@ -97,7 +96,7 @@ class RequestRecorder:
 
     def _record_answer(self, request: Request, decision: Decision, taken_s: float, draw: Draw | None) -> None:
         policy = decision.policy
-        said = request.episode or NO_EPISODE
+        said = request.episode
         episode, step = self._place(request, decision, said)
         known, rows = self._format(policy), decision.batch or 1
         # Copies: binary input is a view of the whole request's body, which may be a thousand times as large.
@@ -126,7 +125,7 @@ class RequestRecorder:
         self.recorder.record(record)
 
     def _record_failure(self, request: Request, store: PolicyStore, code: str, taken_ms: float) -> None:
-        said = request.episode or NO_EPISODE
+        said = request.episode
         if said.final_status is not None:
             return  # no decision was requested; the episode continues until its end is reported
         session_id = said.session_id
@@ -193,10 +192,8 @@ def _episode_of(request: Request) -> str:
 
 
 def _session_of(request: Request) -> str | None:
-    if request.episode is None or request.episode.session_id is None:
-        return None
     session_id = request.episode.session_id
-    return session_id if isinstance(session_id, str) else f"#{session_id}"  # 7 and "7" are different sessions
+    return f"#{session_id}" if isinstance(session_id, int) else session_id  # 7 and "7" are different sessions
 
 
 def _request_id(request: Request) -> str | None:
