@@ -66,6 +66,7 @@ class Transport:
             raise UsageError(f"retries must be 0 or more, got {retries}")
         self._timeout_s = timeout_s
         self._retries = retries
+        self._place = httpcore.URL(self.url)
         # Replies are a few hundred bytes: compressing them costs more than it saves.
         self._headers = [
             (b"host", urlsplit(self.url).netloc.encode()),
@@ -160,10 +161,11 @@ class Transport:
         if self._is_closed:
             raise UsageError("the client is closed: create a new one")
         label = [] if self.label is None else [(LABEL_HEADER.encode(), self.label.encode())]
-        budget_s = deadline - time.monotonic()
+        budget_s, place = deadline - time.monotonic(), self._place
+        path = place.target.rstrip(b"/") + target.encode()
         request = httpcore.Request(
             method,
-            self.url + target,
+            httpcore.URL(scheme=place.scheme, host=place.host, port=place.port, target=path),  # parsing it takes longer
             headers=[*self._headers, *headers, *label],
             content=body,
             extensions={"timeout": {"pool": max(budget_s, 0.0)}},
