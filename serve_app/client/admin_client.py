@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.client.http_transport import Transport, encode
+from rlservo.serve_app.client.http_transport import Transport
 from rlservo.serve_app.interface import Closeable
 from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.admin_key_file import key_file, read_key
@@ -44,7 +44,7 @@ class AdminClient(Closeable):
 
     def metrics(self) -> str:
         """Return the metrics in Prometheus' format."""
-        return self._transport.get_text("metrics", timeout_s=LOOK_TIMEOUT_S)
+        return self._transport.get_bytes("metrics", timeout_s=LOOK_TIMEOUT_S).decode("utf-8", "replace")
 
     def recordings(self) -> dict[str, int]:
         """Return the server's recordings: the files' names, and the present size of each in bytes."""
@@ -90,7 +90,7 @@ class AdminClient(Closeable):
 
     def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
         """Send a command (`load`, `unload`, `alias`, `rollback`, `canary`, `shadow`); return the new listing."""
-        reply: dict[str, Any] = self._transport.post("v1", "admin", "policies", name, command, body=encode(document))
+        reply: dict[str, Any] = self._transport.post("v1", "admin", "policies", name, command, document=document)
         return reply
 
 

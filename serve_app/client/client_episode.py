@@ -18,37 +18,28 @@ class ClientEpisode:
     """Episodes of a client, and their fields in a request.
 
     The recurrent state is kept here and sent with every request, or with `server_state` it stays on the server: in a
-    session of this client, or with a stream's connection. If the server limits the step from the last action, that is
-    sent whenever the server's may differ from the robot's command.
+    session of this client, or with a stream's connection. The last action is part of it: it is sent as well whenever
+    the server's may differ from the robot's command.
     """
 
     def __init__(self, *, server_state: bool, is_stream: bool) -> None:
         self._server_state = server_state
         self._is_stream = is_stream
-        self._session_id = uuid.uuid4().hex if server_state and not is_stream else None
-        self._has_unanswered_start = False  # this request may reach the server after the next one
-        self._is_limited = False  # whether the server limits the step of a stateless policy
+        self._session_id = ""
+        self._is_id_spent = True  # a request with it may reach the server after the next one
         self.reset()
 
     def reset(self) -> None:
         """Start an episode."""
-        self._state: dict[str, Any] = {}  # empty at an episode's start
+        self._state: dict[str, Any] | None = {}  # of the last reply; None if the version that gave it has none
         self._steps = 0
         self._last_action: Any = None
         self._is_last_action_known = True  # whether the server has the same action
         self._is_lost = False
 
-    def is_on_server(self, contract: Contract) -> bool:
-        """Return whether the server keeps the episode's recurrent state."""
-        return self._server_state and (bool(contract.state) or not self._is_stream)
-
-    def is_carried(self, contract: Contract) -> bool:
-        """Return whether requests carry a `state`."""
-        return not self.is_on_server(contract) and (bool(contract.state) or self._is_limited)
-
     def carry(self) -> None:
         """Send a `state` from now on, since the server has refused a request without one."""
-        self._is_limited = True
+        self._state = {}
 
     def set_last_action(self, action: Any) -> None:
         """Note the robot's command instead of the server's action."""
@@ -56,7 +47,6 @@ class ClientEpisode:
 
     def reconnect(self) -> None:
         """Note a new connection, which has no memory of the episode."""
-        self._is_last_action_known = False
         self._is_lost = self._steps > 0
 
     @property
@@ -65,27 +55,25 @@ class ClientEpisode:
         return self._steps > 0
 
     def request_fields(self, contract: Contract, batch: tuple[int, ...], *, ends: bool = False) -> dict[str, Any]:
-        """Return the next request's fields on the episode; `ends` if it reports the end.
+        """Return the next request's fields on the episode, `ends` if it reports the end.
 
         Before its reply, the server may have decided an action that never reached the robot.
 
         Raises SessionLostError when the recurrent state was lost with a connection.
         """
         fields: dict[str, Any] = {}
-        if self.is_on_server(contract):
+        if self._is_on_server(contract):
             if self._is_lost:
                 raise SessionLostError("the connection broke and the episode's memory was lost: call reset()")
             fields["reset"] = self._steps == 0
-            if self._session_id is not None:
-                if self._has_unanswered_start:
+            if not self._is_stream:
+                if self._is_id_spent:
                     self._session_id = uuid.uuid4().hex
-                self._has_unanswered_start = self._steps == 0
+                self._is_id_spent = self._steps == 0
                 fields["session_id"] = self._session_id
                 fields |= {"end": True} if ends else {}
-        elif self.is_carried(contract):
+        elif self._state is not None:
             fields["state"] = self._state
-        elif self._is_stream and self._steps == 0:
-            fields["reset"] = True  # number of the last action, kept by the connection
         has_last_action = bool(fields) or self._is_stream
         if has_last_action and not self._is_last_action_known and is_action(self._last_action, batch, contract):
             fields["last_action"] = self._last_action
@@ -95,21 +83,24 @@ class ClientEpisode:
     def end(self) -> None:
         """Note that the server knows the episode's end: the next episode gets its own session."""
         self.reset()
-        if self._session_id is not None:
-            self._session_id = uuid.uuid4().hex
+        self._is_id_spent = True
 
     def advance(self, reply: Mapping[str, Any], action: Any, contract: Contract) -> None:
         """Advance to the next step after a reply; `action` is the reply's.
 
         Raises SessionLostError when the reply belongs to another episode, UnavailableError when it lacks the state.
         """
-        self._has_unanswered_start = False
-        if self.is_on_server(contract) and (contract.state or "session_step" in reply):
+        self._is_id_spent = False
+        if not self._is_on_server(contract):
+            self._state = next_state(reply, contract)
+            self._steps += 1
+        elif contract.state or "session_step" in reply:
             self._steps = check_step(reply, self._steps)
         else:
-            if self.is_carried(contract):
-                self._state = next_state(reply, contract)
             self._steps += 1
         # The loop may write into its own.
         self._last_action = action.copy() if isinstance(action, np.ndarray) else copy.deepcopy(action)
         self._is_last_action_known = True
+
+    def _is_on_server(self, contract: Contract) -> bool:
+        return self._server_state and (bool(contract.state) or not self._is_stream)

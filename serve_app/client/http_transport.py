@@ -6,49 +6,39 @@ that is incomplete by then is never returned.
 
 from __future__ import annotations
 
-import contextlib
-import json
 import os
 import random
-import ssl
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
-from urllib.parse import SplitResult, quote, urlsplit
+from urllib.parse import quote, urlsplit
 
+import httpcore
 import numpy as np
+import orjson
 
 from rlservo.export.contract.errors import DeadlineError, TooLargeError, UnavailableError, UsageError
-from rlservo.export.contract.extras import needs_extra
-
-with needs_extra("client", what="the HTTP client"):
-    import httpcore
-
 from rlservo.serve_app.client.replies import decode_error, excerpt
-from rlservo.serve_app.wire.addresses import host_of, parse_address
-from rlservo.serve_app.wire.bounded_http import FAILURES, DeadlineBackend, connection_pool
+from rlservo.serve_app.wire.addresses import parse_address
+from rlservo.serve_app.wire.bounded_http import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool, time_left
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
-
-try:  # three times faster than the standard library for an image; optional for the client
-    import orjson
-except ModuleNotFoundError:
-    orjson = None  # type: ignore[assignment]
 
 FIRST_WAIT_S = 0.05  # before the second attempt; doubled each time
 LONGEST_WAIT_S = 2.0
 FIRST_BYTES = 65536
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; a wrong URL must not fill the memory
-LABEL = LABEL_HEADER.encode()
 KEEPALIVE_S = 5.0  # that an idle connection is kept
 SCHEMES = {"http": "http", "https": "https"}
-PATH_CHARACTERS = "/%:@!$&'()*+,;=~"  # of a server's address, kept as given
-GATEWAYS = (500, 502)  # without an error of ours: the server behind a proxy has died (Ray's HAProxy answers 500)
-Headers = Sequence[tuple[bytes, bytes]]
-Reply = tuple[int, Headers, bytes]  # status, headers, body
+RETRIED = (500, 502, 503)  # the first two without an error of ours: a gateway, whose server has died (HAProxy, nginx)
 DROPS = (httpcore.RemoteProtocolError, httpcore.ReadError, httpcore.WriteError)
+Headers = Sequence[tuple[bytes, bytes]]
 
 
-class DroppedError(UnavailableError):
+class BrokenError(UnavailableError):
+    """The connection is missing or closed, so there is no answer."""
+
+
+class DroppedError(BrokenError):
     """The server closed the connection before it answered."""
 
 
@@ -76,11 +66,10 @@ class Transport:
             raise UsageError(f"retries must be 0 or more, got {retries}")
         self._timeout_s = timeout_s
         self._retries = retries
-        parts = urlsplit(self.url)
-        self._address = (parts.scheme.encode(), host_of(parts), parts.port, quote(parts.path, safe=PATH_CHARACTERS))
+        self._place = httpcore.URL(self.url)
         # Replies are a few hundred bytes: compressing them costs more than it saves.
         self._headers = [
-            (b"host", _host_header(parts)),
+            (b"host", urlsplit(self.url).netloc.encode()),
             (b"accept", b"application/json"),
             (b"accept-encoding", b"identity"),
             (b"user-agent", b"rlservo-client"),
@@ -88,8 +77,9 @@ class Transport:
         if api_key is not None:
             self._headers.append((b"authorization", f"Api-Key {api_key}".encode()))
         self._backend = DeadlineBackend()
+        certificates = os.environ.get("SSL_CERT_FILE")
         self._pool = connection_pool(
-            self.url, self._backend, _certificates, max_connections=100, keepalive_expiry=KEEPALIVE_S
+            self.url, self._backend, certificates, max_connections=100, keepalive_expiry=KEEPALIVE_S
         )
         self._is_closed = False
         self.label: str | None = None
@@ -100,172 +90,125 @@ class Transport:
         """Number of connections after the first."""
         return max(0, self._backend.connections - 1)
 
-    def get(self, *path: str, timeout_s: float | None = None, retries: int | None = None) -> Any:
+    def get(self, *path: str, timeout_s: float | None = None) -> Any:
         """Return the JSON at `/path[0]/path[1]/...`."""
-        return self._parse(*self._call("GET", path, None, timeout_s, retries))
-
-    def get_text(self, *path: str, timeout_s: float | None = None) -> str:
-        """Return the text at `/path[0]/path[1]/...`."""
-        return self.get_bytes(*path, timeout_s=timeout_s).decode("utf-8", "replace")
+        return self._parse(self._call("GET", path, None, timeout_s))
 
     def get_bytes(self, *path: str, timeout_s: float | None = None) -> bytes:
         """Return the content at `/path[0]/path[1]/...`."""
-        content, *_ = self._call("GET", path, None, timeout_s, None)
-        return content
+        return self._call("GET", path, None, timeout_s)
 
-    def post(self, *path: str, body: bytes, timeout_s: float | None = None) -> Any:
-        """Send a JSON document and return the JSON answer."""
-        return self._parse(*self._call("POST", path, body, timeout_s, None))
+    def post(self, *path: str, document: Mapping[str, Any], timeout_s: float | None = None) -> Any:
+        """Send a document as JSON and return the JSON answer.
 
-    def check_open(self) -> None:
-        """Raise UsageError after `close`."""
-        if self._is_closed:
-            raise UsageError("the client is closed: create a new one")
+        numpy arrays become nested lists of numbers that are exact to the bit when read.
+        """
+        body = orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY, default=np.ndarray.tolist)
+        return self._parse(self._call("POST", path, body, timeout_s))
 
     def close(self) -> None:
         """Close the connections. A call after that raises UsageError."""
         self._is_closed = True
         self._pool.close()
 
-    def _call(
-        self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None, retries: int | None
-    ) -> tuple[bytes, str, int]:
-        """Try until there is an answer, no time or no retry left; return the content, its address and the status.
+    def _call(self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None) -> bytes:
+        """Try until there is an answer, no time or no retry left; return the content.
 
         Raises DeadlineError if the answer did not come in time (never retried: the server may still be working),
         UnavailableError if the server cannot be reached or keeps answering 503, or a gateway 500 or 502, and otherwise
         the error that the server names.
         """
-        self.check_open()
-        url = "/".join((self.url, *(quote(part, safe="") for part in path)))
-        scheme, host, port, prefix = self._address
-        target = "/".join((prefix, *(quote(part, safe="") for part in path))) or "/"
-        address = httpcore.URL(scheme=scheme, host=host, port=port, target=target)
-        budget = self._timeout_s if timeout_s is None else timeout_s
-        deadline = time.monotonic() + budget
-        retries = self._retries if retries is None else retries
-        for attempt, wait in enumerate(_waits(retries)):
+        target = "".join(f"/{quote(part, safe='')}" for part in path)
+        headers = []
+        if body is not None:
+            headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
+        deadline = time.monotonic() + (self._timeout_s if timeout_s is None else timeout_s)
+        attempt = 0
+        while True:
+            # Jitter keeps a fleet of robots from retrying at once.
+            wait = min(FIRST_WAIT_S * 2**attempt, LONGEST_WAIT_S) * random.uniform(0.75, 1.25)
             try:
-                status, headers, content = self._exchange(method, address, body, deadline, budget)
-            except UnavailableError as error:
-                failure = error
-                if attempt == 0 and wait is not None and isinstance(error, DroppedError):
+                response, content = self.exchange(method, target, headers, body, deadline)
+            except BrokenError as error:
+                failure: UnavailableError = error
+                if attempt == 0 and isinstance(error, DroppedError):
                     wait = 0.0  # a server that closed an idle connection is probably still running
             else:
-                if status < 300:
-                    return content, url, status
-                refusal = decode_error(url, status, content)
-                is_gateways = status in GATEWAYS and isinstance(refusal, UnavailableError)
-                if status != 503 and not is_gateways:
+                if response.status < 300:
+                    return content
+                refusal = decode_error(self.url + target, response.status, content)
+                if response.status not in RETRIED or not isinstance(refusal, UnavailableError):
                     raise refusal
-                failure = refusal if isinstance(refusal, UnavailableError) else UnavailableError(refusal.message)
-                failure.retry_after_s = _retry_after_s(headers)
-                if wait is not None and failure.retry_after_s is not None:
-                    wait = failure.retry_after_s
+                failure = refusal
+                failure.retry_after_s = _retry_after_s(response.headers)
+                wait = wait if failure.retry_after_s is None else failure.retry_after_s
             # A wait beyond the caller's budget is useless: report the failure now.
-            if wait is None or time.monotonic() + wait >= deadline:
+            if attempt == self._retries or time.monotonic() + wait >= deadline:
                 raise failure
             time.sleep(wait)
-        raise AssertionError("the last wait is None")
+            if time.monotonic() >= deadline:
+                raise failure
+            attempt += 1
 
-    def upgrade(self, path: str, headers: Headers, deadline: float) -> tuple[httpcore.Response, bytes]:
-        """Ask for another protocol at `path`; return the response, to be closed, and the first bytes behind its head.
+    def exchange(
+        self, method: str, target: str, headers: Headers, body: bytes | None, deadline: float
+    ) -> tuple[httpcore.Response, bytes]:
+        """Return the response to one attempt, and its whole body. Raises BrokenError and DeadlineError.
 
-        With status 101 these are the protocol's own, and its `network_stream` has the connection; otherwise they are
-        the whole body. Raises UnavailableError and DeadlineError.
+        With status 101 it is still to be closed: its `network_stream` has the connection, and the bytes are the first
+        of the other protocol.
         """
-        scheme, host, port, prefix = self._address
-        url = httpcore.URL(scheme=scheme, host=host, port=port, target=prefix + path)
-        request = httpcore.Request("GET", url, headers=self._labelled(*headers))
-        with self._attempt(deadline, round(deadline - time.monotonic(), 2)) as timeout:
-            request.extensions = {"timeout": timeout}
+        if self._is_closed:
+            raise UsageError("the client is closed: create a new one")
+        label = [] if self.label is None else [(LABEL_HEADER.encode(), self.label.encode())]
+        budget_s, place = deadline - time.monotonic(), self._place
+        path = place.target.rstrip(b"/") + target.encode()
+        request = httpcore.Request(
+            method,
+            httpcore.URL(scheme=place.scheme, host=place.host, port=place.port, target=path),  # parsing it takes longer
+            headers=[*self._headers, *headers, *label],
+            content=body,
+            extensions={"timeout": {"pool": max(budget_s, 0.0)}},
+        )
+        self._backend.deadline.at = deadline
+        try:
             response = self._pool.handle_request(request)
-            if response.status != 101:
-                return response, self._read(response, deadline)
+            is_left_open = False
             try:
-                return response, response.extensions["network_stream"].read(FIRST_BYTES)
-            except BaseException:
-                response.close()
-                raise
-
-    def _exchange(self, method: str, url: httpcore.URL, body: bytes | None, deadline: float, budget: float) -> Reply:
-        """Return the reply to one attempt."""
-        headers = self._labelled()
-        if body is not None:
-            headers = [*headers, (b"content-type", b"application/json"), (b"content-length", b"%d" % len(body))]
-        with self._attempt(deadline, budget) as timeout:
-            request = httpcore.Request(method, url, headers=headers, content=body, extensions={"timeout": timeout})
-            response = self._pool.handle_request(request)
-            return response.status, response.headers, self._read(response, deadline)
-
-    def _labelled(self, *more: tuple[bytes, bytes]) -> list[tuple[bytes, bytes]]:
-        return [*self._headers, *more, *([] if self.label is None else [(LABEL, self.label.encode())])]
-
-    def _read(self, response: httpcore.Response, deadline: float) -> bytes:
-        content = b""
-        try:
-            for chunk in response.iter_stream():
-                content += chunk
-                if time.monotonic() > deadline:
-                    raise httpcore.ReadTimeout
-                if len(content) > MAX_REPLY_BYTES:
-                    raise TooLargeError(
-                        f"{self.url} sent more than {MAX_REPLY_BYTES >> 20} MiB: is it an rlservo server?"
-                    )
-        finally:
-            response.close()  # an unread rest closes the connection, so a late answer cannot reach the next request
-        if time.monotonic() > deadline:
-            raise httpcore.ReadTimeout
-        return content
-
-    @contextlib.contextmanager
-    def _attempt(self, deadline: float, budget: float) -> Iterator[dict[str, float]]:
-        """Give httpcore's time-outs of one attempt; raise its failures as errors of ours."""
-        remaining = deadline - time.monotonic()
-        self._backend.deadline = deadline
-        try:
-            if remaining <= 0:
-                raise httpcore.ReadTimeout
-            yield dict.fromkeys(("connect", "read", "write", "pool"), remaining)
-        except (httpcore.ReadTimeout, httpcore.WriteTimeout) as error:
-            raise DeadlineError(f"{self.url} did not answer within {budget:g} s", {"timeout_s": budget}) from error
+                if response.status == 101:
+                    first = response.extensions["network_stream"].read(FIRST_BYTES)
+                    is_left_open = True
+                    return response, first
+                return response, self._read(response, deadline)
+            finally:
+                if not is_left_open:
+                    response.close()  # if unread, with its connection: a late answer cannot reach the next request
         except httpcore.ConnectTimeout as error:
-            raise UnavailableError(f"{self.url} cannot be reached within {budget:g} s", {"url": self.url}) from error
+            raise BrokenError(f"{self.url} cannot be reached within {budget_s:.3g} s", {"url": self.url}) from error
+        except TIMEOUTS as error:
+            raise DeadlineError(f"{self.url} did not answer within {budget_s:.3g} s") from error
         except FAILURES as error:
             why = str(error) or type(error).__name__
             if isinstance(error, DROPS):
                 raise DroppedError(f"{self.url} dropped the connection: {why}", {"url": self.url}) from error
-            raise UnavailableError(f"{self.url} cannot be reached: {why}", {"url": self.url}) from error
-        finally:
-            self._backend.deadline = None
+            raise BrokenError(f"{self.url} cannot be reached: {why}", {"url": self.url}) from error
 
-    def _parse(self, content: bytes, url: str, status: int) -> Any:
+    def _read(self, response: httpcore.Response, deadline: float) -> bytes:
+        content = b""
+        for chunk in response.iter_stream():
+            content += chunk
+            if len(content) > MAX_REPLY_BYTES:
+                raise TooLargeError(f"{self.url} sent more than {MAX_REPLY_BYTES >> 20} MiB: is it an rlservo server?")
+        time_left(deadline)
+        return content
+
+    def _parse(self, content: bytes) -> Any:
         try:
-            return json.loads(content) if orjson is None else orjson.loads(content)
+            return orjson.loads(content)
         except ValueError as error:
             raise UnavailableError(
-                f"{url} answered {status} with {excerpt(content)}, which is not JSON: is it an rlservo server?"
+                f"{self.url} answered with {excerpt(content)}, which is not JSON: is it an rlservo server?"
             ) from error
-
-
-def encode(document: Mapping[str, Any]) -> bytes:
-    """Return `document` as JSON; numpy arrays become nested lists of numbers that are exact to the bit when read."""
-    if orjson is not None:
-        return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY, default=_plain)
-    return json.dumps(document, default=_plain, allow_nan=False).encode()
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be sent as JSON")
-
-
-def _waits(retries: int) -> Iterator[float | None]:
-    """Yield the wait after each attempt; None after the last. Jitter keeps a fleet of robots from retrying at once."""
-    for attempt in range(retries):
-        yield min(FIRST_WAIT_S * 2**attempt, LONGEST_WAIT_S) * random.uniform(0.75, 1.25)
-    yield None
 
 
 def _retry_after_s(headers: Headers) -> float | None:
@@ -275,17 +218,3 @@ def _retry_after_s(headers: Headers) -> float | None:
     except ValueError:
         return None
     return seconds if seconds >= 0 else None  # also refuses NaN
-
-
-def _certificates() -> ssl.SSLContext:
-    """Return the certificates for checking servers: SSL_CERT_FILE's or SSL_CERT_DIR's, else certifi's."""
-    file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
-    if file or folder:
-        return ssl.create_default_context(cafile=file or None, capath=None if file else folder)
-    return httpcore.default_ssl_context()
-
-
-def _host_header(parts: SplitResult) -> bytes:
-    host = host_of(parts)
-    host = b"[%s]" % host if b":" in host else host
-    return host if parts.port is None else b"%s:%d" % (host, parts.port)

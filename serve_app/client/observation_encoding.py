@@ -17,28 +17,24 @@ from rlservo.serve_app.interface import Observation
 def encode_observation(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
     """Return (encoded observation, batch axis as () or (B,)); the server checks shapes and names."""
     space = contract.observation_space
-    if isinstance(space, DictSpec | TupleSpec):
-        return _encode_part(obs, space, "obs")
-    if isinstance(obs, Mapping):
+    if isinstance(obs, Mapping) and not isinstance(space, DictSpec):  # element names and values
         elements = {str(name): _finite_array(value, f"element {name!r}") for name, value in obs.items()}
         return elements, next((value.shape[:1] for value in elements.values()), ())
-    array = _finite_array(obs, "")
-    batch = array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
-    return array, batch
+    return _encode_part(obs, space, "")
 
 
 def _encode_part(obs: Any, space: SpaceSpec, path: str) -> tuple[Any, tuple[int, ...]]:
-    if isinstance(space, DictSpec | TupleSpec):
-        inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
-        try:
-            parts = {key: _encode_part(obs[key], child, f"{path}.{key}") for key, child in inside}
-        except (KeyError, IndexError, TypeError) as error:
-            raise ObservationError(f"the observation does not have the parts of {path}: {error!r}") from error
-        plain = {key: part for key, (part, _) in parts.items()}
-        batch = next((axis for _, axis in parts.values()), ())
-        return (plain if isinstance(space, DictSpec) else list(plain.values())), batch
-    array = _finite_array(obs, f"part {path}")
-    return array, array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
+    if not isinstance(space, DictSpec | TupleSpec):
+        array = _finite_array(obs, f"part obs{path}" if path else "")
+        return array, array.shape[:1] if array.ndim == len(space.shape) + 1 else ()
+    inside = space.spaces.items() if isinstance(space, DictSpec) else enumerate(space.spaces)
+    try:
+        parts = {key: _encode_part(obs[key], child, f"{path}.{key}") for key, child in inside}
+    except (KeyError, IndexError, TypeError) as error:
+        raise ObservationError(f"the observation does not have the parts of obs{path}: {error!r}") from error
+    plain = {key: part for key, (part, _) in parts.items()}
+    batch = next((axis for _, axis in parts.values()), ())
+    return (plain if isinstance(space, DictSpec) else list(plain.values())), batch
 
 
 def _finite_array(value: ArrayLike, where: str) -> NDArray[Any]:

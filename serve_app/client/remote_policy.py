@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import secrets
 import time
 from abc import abstractmethod
 from pathlib import Path
@@ -22,13 +23,14 @@ from rlservo.export.contract.contract import Contract, first_fault
 from rlservo.export.contract.errors import (
     DeadlineError,
     RlservoError,
+    StateNeededError,
     UnavailableError,
     UnknownPolicyError,
     UnknownVersionError,
     UsageError,
 )
 from rlservo.serve_app.client.client_episode import ClientEpisode
-from rlservo.serve_app.client.http_transport import Transport
+from rlservo.serve_app.client.http_transport import SCHEMES, Transport
 from rlservo.serve_app.client.observation_encoding import encode_observation
 from rlservo.serve_app.client.replies import answering_version, check_successor, decode_action
 from rlservo.serve_app.interface import ActingPolicy, Observation
@@ -49,30 +51,46 @@ ASK_AGAIN_S = 0.01  # another process may answer next
 class RemotePolicy(ActingPolicy):
     """A policy on a server. Contracts come over HTTP; a client adds the way of a request for an action."""
 
+    _is_stream = False
+    _schemes = SCHEMES
+
     def __init__(
         self,
-        transport: Transport,
-        policy: str | None,
+        url: str,
+        policy: str | None = None,
         *,
-        version: str | None,
-        timeout_s: float,
-        deadline_ms: float | None,
-        episode: ClientEpisode,
-        record: str | Path | Recorder | None,
+        version: str | None = None,
+        timeout_s: float = 5.0,
+        retries: int = 2,
+        api_key: str | None = None,
+        deadline_ms: float | None = None,
+        server_state: bool = False,
+        record: str | Path | Recorder | None = None,
+        label: str | None = None,
     ) -> None:
-        """Check the arguments, then open the recording, so that a failing constructor leaves no file behind."""
+        """Check the arguments; the first request is sent when `contract` or `act` needs it.
+
+        `policy` may be None if the server has exactly one. `timeout_s` bounds the first contact including its retries,
+        `deadline_ms` (by default the same) each `act`. `retries` counts further attempts of an HTTP request after a
+        failed connection or a 503; nothing else is ever sent twice. `record` keeps every decision: a new .mcap file, a
+        folder, or a Recorder. `label` names this loop in the server's own recording, by default a random name does.
+        """
+        if label is not None and not (label and label.isascii() and label.isprintable() and len(label) <= 100):
+            raise UsageError(f"label must be 1 to 100 printable ASCII characters, got {label[:100]!r}")
         if deadline_ms is not None and not deadline_ms > 0:
             raise UsageError(f"deadline_ms must be above 0, got {deadline_ms}")
         if policy == "":
             raise UsageError("the policy name is empty: give a name, or None if the server has only one policy")
         if version is not None and policy is None:
             raise UsageError(f"version {version!r} was given without the policy's name")
-        self.url = transport.url
-        self._transport = transport
+        self._transport = Transport(url, timeout_s=timeout_s, retries=retries, api_key=api_key, schemes=self._schemes)
+        self.url = self._transport.url
         self._name = policy
         self._version = version
+        self._label = label
+        self._timeout_s = timeout_s
         self._deadline_ms = 1e3 * timeout_s if deadline_ms is None else deadline_ms
-        self._episode = episode
+        self._episode = ClientEpisode(server_state=server_state, is_stream=self._is_stream)
         self._contract: Contract | None = None
         self._looks_up = False
         """Whether the contract is fetched again before the next request, because its alias may have moved."""
@@ -83,7 +101,14 @@ class RemotePolicy(ActingPolicy):
         self._numbers = itertools.count(1)  # next() is atomic: no two requests share a number
         self.last_reply: dict[str, Any] = {}
         """The server's reply to the last request that got an action."""
+        self._renew_label()
+        # Last, so that a failing constructor leaves no file behind.
         self._recording = None if record is None else record_policy(self, record, act=self._act)
+
+    @property
+    def reconnects(self) -> int:
+        """Number of connections after the first."""
+        return self._transport.reconnects
 
     @property
     def contract(self) -> Contract:
@@ -139,7 +164,7 @@ class RemotePolicy(ActingPolicy):
             request, batch = self._encode_request(final_obs, explore=False, seed=None, reward=None)
             if self._episode.has_begun:
                 deadline = time.monotonic() + self._deadline_ms / 1e3
-                reply = self._exchange({**request, **end}, batch, deadline, ends=True)
+                reply = self._exchange({**request, **end}, batch, deadline)
                 answering_version(self.url, reply, request["seq"], self._contract)
         except RlservoError as error:
             logger.warning("the end of the episode was not reported to %s: %s", self.url, error.message)
@@ -161,8 +186,7 @@ class RemotePolicy(ActingPolicy):
         self._episode.reset()
         self._reward = None
         # A version number needs no lookup.
-        known = self._contract
-        self._looks_up = self._version is not None and known is not None and self._version != known.version
+        self._looks_up = self._version not in (None, self._contract and self._contract.version)
         if self._recording is not None:
             self._recording.begin()
 
@@ -170,6 +194,7 @@ class RemotePolicy(ActingPolicy):
         """End the recording and close the connections to the server; later calls raise UsageError."""
         if self._recording is not None:
             self._recording.end()
+        self._disconnect()
         self._transport.close()
 
     def wait_until_ready(self, timeout_s: float = 60.0) -> None:
@@ -195,28 +220,43 @@ class RemotePolicy(ActingPolicy):
         _ = self.contract  # the first contact has its own time-out
         deadline = time.monotonic() + self._deadline_ms / 1e3
         request, batch = self._encode_request(obs, explore=explore, seed=seed, reward=reward)
-        reply = self._exchange(request, batch, deadline, ends=False)
+        reply = self._exchange(request, batch, deadline)
         contract = self._answering_contract(reply, request["seq"], deadline)
         action = decode_action(reply, batch, contract)
         self._episode.advance(reply, action, contract)
         self.last_reply, self._reward = reply, None
         return action
 
-    @abstractmethod
-    def _exchange(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float, *, ends: bool) -> Any:
+    def _exchange(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float) -> Any:
         """Send a request with the episode's fields by `deadline` (`time.monotonic`), and return the reply."""
+        try:
+            return self._send(request, batch, deadline)
+        except StateNeededError:
+            # Another version answers now; or the step from one action to the next is limited, which no contract says.
+            self._episode.carry()
+            self._disconnect()  # only a new stream has a memory
+            self._meet(self._fetch_contract(self._version, max(deadline - time.monotonic(), 0.001)))
+            return self._send(request, batch, deadline)
+
+    @abstractmethod
+    def _send(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float) -> Any:
+        """Send a request once with the episode's fields, and return the reply."""
         ...
 
-    def _find_name(self, timeout_s: float | None, retries: int | None) -> str:
-        """Return the name of the server's only policy."""
-        return _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s, retries=retries))
+    def _disconnect(self) -> None:
+        """End the stream, if there is one."""
+
+    def _renew_label(self) -> None:
+        number = secrets.token_hex(8 if self._label is None else 4)
+        self._transport.label = number if self._label is None else f"{self._label}.{number}"
 
     def _fetch_contract(self, version: str | None, timeout_s: float | None) -> Contract:
-        """Request a contract: once if there is a time-out, otherwise with the client's usual retries."""
-        retries = None if timeout_s is None else 0
-        name = self._name or (self._contract.name if self._contract else self._find_name(timeout_s, retries))
+        """Request a contract, by default with the client's usual time-out."""
+        name = self._name or (self._contract.name if self._contract else None)
+        if name is None:
+            name = _only_policy(self._transport.get("v1", "policies", timeout_s=timeout_s))
         path = ("v1", "policies", name, *(() if version is None else ("versions", version)))
-        document = self._transport.get(*path, timeout_s=timeout_s, retries=retries)
+        document = self._transport.get(*path, timeout_s=timeout_s)
         try:
             return Contract.model_validate(document)
         except ValidationError as error:
@@ -251,19 +291,12 @@ class RemotePolicy(ActingPolicy):
         version = answering_version(self.url, reply, number, contract)
         if version == contract.version:
             return contract
+        refusal = f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}'"
         if self._version is not None:
-            raise UnavailableError(
-                f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}', expected "
-                f"{contract.version!r}: the action was dropped"
-            )
-        known = self._contracts.get(version)
-        if known is None:
-            known = self._fetch_new_version(version, deadline)
-            if (known.name, known.version) != (contract.name, version):
-                raise UnavailableError(
-                    f"{self.url} answered for version {version[:32]!r} of policy '{contract.name}' but has no contract "
-                    "for it: the action was dropped"
-                )
+            raise UnavailableError(f"{refusal}, expected {contract.version!r}: the action was dropped")
+        known = self._contracts.get(version) or self._fetch_new_version(version, deadline)
+        if (known.name, known.version) != (contract.name, version):
+            raise UnavailableError(f"{refusal} but has no contract for it: the action was dropped")
         self._meet(known)
         return known
 

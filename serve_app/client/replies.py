@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import orjson
 
+from rlservo.export.contract import errors
 from rlservo.export.contract.contract import REWARD, Contract
 from rlservo.export.contract.errors import (
     ActionError,
@@ -22,17 +22,25 @@ from rlservo.export.contract.errors import (
     UsageError,
 )
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.export.contract.spaces import LeafSpec, leaf_specs
+from rlservo.export.contract.spaces import leaf_specs
 from rlservo.serve_app.wire.request_names import MARK
+
+CLASSES = {
+    kind.code: kind
+    for kind in vars(errors).values()
+    if isinstance(kind, type) and issubclass(kind, RlservoError) and "code" in vars(kind)
+}
+"""Error classes by code."""
+CLASSES_OF_STATUS = {401: UsageError, 403: UsageError, 408: DeadlineError, 413: TooLargeError, 504: DeadlineError}
+"""Error classes of answers without one of our codes, for example a proxy's."""
 
 
 def decode_error(url: str, status: int, content: bytes) -> RlservoError:
     """Return the error in the body of a failed HTTP reply."""
     try:
-        document = json.loads(content)
+        error = error_of(orjson.loads(content), status)
     except ValueError:
-        document = None
-    error = error_of(document, status)
+        error = None
     if error is not None:
         return error
     if status == 404:  # Ray Serve's own answer while the application is being deployed
@@ -46,38 +54,20 @@ def error_of(document: Any, status: int) -> RlservoError | None:
         return None
     details = document.get("details")
     details = details if isinstance(details, dict) else {}
-    kind = _classes().get(str(document.get("code")), _class_of_status(status))
+    kind = CLASSES.get(str(document.get("code"))) or _class_of_status(status)
     if kind is RequestError and StateNeededError.is_described_by(details):
         kind = StateNeededError
     return kind(document["error"], details)
+
+
+def _class_of_status(status: int) -> type[RlservoError]:
+    return CLASSES_OF_STATUS.get(status) or (RequestError if 400 <= status < 500 else UnavailableError)
 
 
 def excerpt(content: bytes) -> str:
     """Return the beginning of a body for a message."""
     text = content[:80].decode("utf-8", "replace")
     return f"{text!r}{'...' if len(content) > 80 else ''}" if text else "an empty body"
-
-
-def _classes() -> dict[str, type[RlservoError]]:
-    """Return every error class by its code."""
-    classes: dict[str, type[RlservoError]] = {}
-    queue: list[type[RlservoError]] = [RlservoError]
-    while queue:
-        kind = queue.pop(0)
-        classes.setdefault(kind.code, kind)  # a class precedes those that inherit its code
-        queue += kind.__subclasses__()
-    return classes
-
-
-def _class_of_status(status: int) -> type[RlservoError]:
-    """Return the error for an answer without one of our codes, for example a proxy's."""
-    if status in (401, 403):
-        return UsageError
-    if status in (408, 504):
-        return DeadlineError
-    if status == 413:
-        return TooLargeError
-    return UnavailableError if status >= 500 or status < 400 else RequestError
 
 
 def answering_version(url: str, reply: Any, number: int, contract: Contract) -> str:
@@ -100,21 +90,22 @@ def answering_version(url: str, reply: Any, number: int, contract: Contract) -> 
 
 def check_successor(contract: Contract, known: Contract) -> None:
     """Refuse a version whose observations or actions differ from those of the known one."""
-    differing: list[str] = []
-    for word, key in (("observation", "obs"), ("action", "action")):
-        theirs, ours = (leaf_specs(getattr(each, f"{word}_space"), key) for each in (contract, known))
-        leaves = sorted(name for name in theirs.keys() | ours.keys() if theirs.get(name) != ours.get(name))
-        if leaves or getattr(contract, f"{word}_space") != getattr(known, f"{word}_space"):
-            differing += leaves or [f"{word} space"]
-    has_reward, had_reward = (any(tensor.name == REWARD for tensor in each.inputs) for each in (contract, known))
-    differing += [REWARD] if has_reward != had_reward else []
+    parts = [
+        {"observation": each.observation_space, "action": each.action_space, REWARD: _sees_reward(each)}
+        for each in (contract, known)
+    ]
+    differing = [name for name, part in parts[0].items() if part != parts[1][name]]
     if differing:
         raise UnavailableError(
             f"version {contract.version} of policy '{contract.name}' answers now, and differs from version "
-            f"{known.version}, which this client knows, in {', '.join(differing)}: the action was dropped; make a new "
-            "client, or one with version=",
+            f"{known.version}, which this client knows, in {' and '.join(differing)}: the action was dropped; make a "
+            "new client, or one with version=",
             {"version": contract.version, "known": known.version, "differing": differing},
         )
+
+
+def _sees_reward(contract: Contract) -> bool:
+    return any(tensor.name == REWARD for tensor in contract.inputs)
 
 
 def check_step(reply: Mapping[str, Any], steps: int) -> int:
@@ -131,11 +122,11 @@ def check_step(reply: Mapping[str, Any], steps: int) -> int:
     return step
 
 
-def next_state(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any]:
-    """Return the state for the next request. Raises UnavailableError if the server sent none."""
+def next_state(reply: Mapping[str, Any], contract: Contract) -> dict[str, Any] | None:
+    """Return the state for the next request; None without one. Raises UnavailableError if the server sent no state."""
     state = reply.get("state")
     if state is None and not contract.state:
-        return {}  # the state need not be carried any more
+        return None
     names = {name for name in state if not name.startswith(MARK)} if isinstance(state, dict) else None
     if not isinstance(state, dict) or names != {spec.name for spec in contract.state}:
         raise UnavailableError(f"the server's answer for {contract.name!r} lacks the state: the action was dropped")
@@ -162,33 +153,26 @@ def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
 
 
 def _decode(action: Any, batch: tuple[int, ...], chunk: tuple[int, ...], contract: Contract) -> Any:
-    space = contract.action_space
+    space, decoded = contract.action_space, {}
     try:
         leaves = action_leaves(space, action)
     except RequestError as error:
         raise ActionError(f"the server's action for {contract.name!r} cannot be read: {error}") from error
-    specs = leaf_specs(space, "action")
-    return build_action(
-        space, {name: _decode_leaf(leaves[name], batch, chunk, name, specs[name], contract) for name in specs}
-    )
-
-
-def _decode_leaf(
-    action: Any, batch: tuple[int, ...], chunk: tuple[int, ...], name: str, space: LeafSpec, contract: Contract
-) -> NDArray[Any]:
-    shape = (*batch, *chunk, *space.shape)
-    what = f"action for {contract.name!r}" if name == "action" else f"{name} for {contract.name!r}"
-    try:
-        array = np.asarray(action)
-    except ValueError:
-        array = np.asarray(None)
-    if array.dtype.kind not in "fiu" and array.size:
-        raise ActionError(f"the server's {what} is {str(action)[:80]}, expected numbers")
-    if array.shape != shape:
-        raise ActionError(f"the server's {what} has shape {array.shape}, expected {shape}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ActionError(f"the server's {what} has an element that is not finite")
-    converted = array.astype(space.dtype)
-    if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
-        raise ActionError(f"the server's {what} is {str(action)[:80]}, expected {space.dtype}")
-    return converted.reshape((*batch, *space.shape))
+    for name, spec in leaf_specs(space, "action").items():
+        what = f"the server's {name} for {contract.name!r}"
+        leaf, shape = leaves[name], (*batch, *chunk, *spec.shape)
+        try:
+            array = np.asarray(leaf)
+        except ValueError:  # ragged
+            array = np.asarray(None)
+        if array.dtype.kind not in "fiu" and array.size:
+            raise ActionError(f"{what} is {str(leaf)[:80]}, expected numbers")
+        if array.shape != shape:
+            raise ActionError(f"{what} has shape {array.shape}, expected {shape}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ActionError(f"{what} has an element that is not finite")
+        converted = array.astype(spec.dtype)
+        if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
+            raise ActionError(f"{what} is {str(leaf)[:80]}, expected {spec.dtype}")
+        decoded[name] = converted.reshape((*batch, *spec.shape))
+    return build_action(space, decoded)

@@ -10,19 +10,14 @@ import contextlib
 import socket
 import time
 
-from rlservo.export.contract.errors import DeadlineError, UnavailableError
-from rlservo.export.contract.extras import needs_extra
-from rlservo.serve_app.client.http_transport import Transport
-from rlservo.serve_app.client.replies import decode_error
+from websockets.client import ClientProtocol
+from websockets.frames import Frame, Opcode
+from websockets.uri import parse_uri
 
-with needs_extra("client", what="the WebSocket client"):
-    from websockets.client import ClientProtocol
-    from websockets.datastructures import Headers
-    from websockets.exceptions import InvalidHandshake
-    from websockets.frames import Frame, Opcode
-    from websockets.http11 import Response
-    from websockets.protocol import Protocol, Side
-    from websockets.uri import parse_uri
+from rlservo.export.contract.errors import DeadlineError
+from rlservo.serve_app.client.http_transport import BrokenError, Transport
+from rlservo.serve_app.client.replies import decode_error
+from rlservo.serve_app.wire.bounded_http import send_all, time_left
 
 MAX_FRAME_BYTES = 64 << 20  # larger than any action or contract
 RECEIVE_BYTES = 65536
@@ -37,26 +32,20 @@ class WebSocket:
         Raises BrokenError, DeadlineError, or what the server names.
         """
         self._url = url = transport.url
-        client = ClientProtocol(parse_uri(f"{url}{path}"))
-        offered = [(n.encode(), v.encode()) for n, v in client.connect().headers.raw_items() if n != "Host"]
-        try:
-            self._response, first = transport.upgrade(path, offered, deadline)
-        except UnavailableError as error:
-            raise BrokenError(error.message, error.details) from error
+        self._protocol = ClientProtocol(parse_uri(f"{url}{path}"), max_size=MAX_FRAME_BYTES)
+        offered = self._protocol.connect().headers.raw_items()
+        headers = [(name.encode(), value.encode()) for name, value in offered if name != "Host"]
+        self._response, first = transport.exchange("GET", path, headers, None, deadline)
         if self._response.status != 101:
             raise decode_error(url, self._response.status, first)
         self._socket: socket.socket = self._response.extensions["network_stream"].get_extra_info("socket")
-        self._protocol = Protocol(Side.CLIENT, max_size=MAX_FRAME_BYTES)
-        self._pieces: list[bytes] = []
-        self._text = False
-        headers = Headers([(name.decode("latin-1"), value.decode("latin-1")) for name, value in self._response.headers])
-        try:
-            client.process_response(Response(101, "", headers))
-        except InvalidHandshake as failure:
-            self.close()
-            raise BrokenError(f"{url} is not a stream ({failure}): is it an rlservo server?") from failure
-        self._protocol.receive_data(first)
+        self._frames: list[Frame] = []  # of an incomplete message
+        head = b"".join(b"%s: %s\r\n" % header for header in self._response.headers)
+        self._protocol.receive_data(b"HTTP/1.1 101 Switching Protocols\r\n%s\r\n%s" % (head, first))
         self._events = self._protocol.events_received()
+        if self._protocol.handshake_exc is not None:
+            self.close()
+            raise BrokenError(f"{url} is not a stream ({self._protocol.handshake_exc}): is it an rlservo server?")
         self.last_receive_at = time.monotonic()
         """Time of the server's last bytes."""
 
@@ -80,11 +69,20 @@ class WebSocket:
         """
         while True:
             while self._events:
-                message = self._message(self._events.pop(0))
-                if message is not None:
-                    return message
+                frame = self._events.pop(0)
+                if isinstance(frame, Frame) and frame.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+                    self._frames.append(frame)
+                    if frame.fin:
+                        frames, self._frames = self._frames, []
+                        content = b"".join(each.data for each in frames)
+                        return content.decode("utf-8", "replace") if frames[0].opcode is Opcode.TEXT else content
             try:
-                self._receive_bytes(deadline)
+                self._socket.settimeout(time_left(deadline))
+                if data := self._socket.recv(RECEIVE_BYTES):
+                    self._protocol.receive_data(data)
+                else:
+                    self._protocol.receive_eof()
+                self.last_receive_at = time.monotonic()
                 self._events += self._protocol.events_received()
                 self._flush(deadline)  # the reply to a ping or a close
             except TimeoutError:
@@ -105,42 +103,5 @@ class WebSocket:
         with contextlib.suppress(OSError):
             self._response.close()
 
-    def _message(self, frame: object) -> bytes | str | None:
-        """Return a message when `frame` completes one."""
-        if not isinstance(frame, Frame) or frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
-            return None
-        if frame.opcode is not Opcode.CONT:
-            self._pieces, self._text = [], frame.opcode is Opcode.TEXT
-        self._pieces.append(bytes(frame.data))
-        if not frame.fin:
-            return None
-        content = b"".join(self._pieces)
-        return content.decode("utf-8", "replace") if self._text else content
-
-    def _receive_bytes(self, deadline: float) -> None:
-        self._socket.settimeout(_remaining(deadline))
-        data = self._socket.recv(RECEIVE_BYTES)
-        self.last_receive_at = time.monotonic()
-        if data:
-            self._protocol.receive_data(data)
-        else:
-            self._protocol.receive_eof()
-
     def _flush(self, deadline: float) -> None:
-        for data in self._protocol.data_to_send():
-            if data:
-                self._socket.settimeout(_remaining(deadline))
-                self._socket.sendall(data)
-
-
-class BrokenError(UnavailableError):
-    """The connection is missing or closed: a new one may be opened."""
-
-    code = "connection-broken"
-
-
-def _remaining(deadline: float) -> float:
-    remaining = deadline - time.monotonic()
-    if remaining <= 0:
-        raise TimeoutError("the deadline has passed")
-    return remaining
+        send_all(self._socket, b"".join(self._protocol.data_to_send()), deadline)

@@ -8,8 +8,7 @@ server that records, the graph's name is followed by the episode's name and the 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.runtime.policy import Policy, Step
@@ -20,46 +19,28 @@ MARK_BEGINS = "~"  # no policy's identity has one
 LONGEST_EPISODE_ID = 256
 
 
-@dataclass(frozen=True, slots=True)
-class CarriedState:
+class CarriedState(NamedTuple):
     """The parts of a state in a request."""
 
-    arrays: Mapping[str, Any]
-    """By state name."""
-
-    is_empty: bool = False
-    """Whether an episode begins."""
-
-    policy_identity: str | None = None
-    """Identity of the policy that produced the state; None if the client has dropped it."""
-
-    last_action: Any = None
-
-    mark: EpisodeStep | None = None
-
-    @classmethod
-    def parse(cls, state: Mapping[str, Any]) -> CarriedState:
-        """Parse a request's state. Raises RequestError."""
-        if not state:
-            return NO_STATE
-        arrays = {name: value for name, value in state.items() if not str(name).startswith(MARK)}
-        if len(arrays) == len(state):
-            return cls(arrays)
-        unknown = [name for name in state if name not in arrays and name not in (BELONGS_TO, LAST_ACTION)]
-        if unknown:
-            raise RequestError(
-                f"the state has the unknown entry '{str(unknown[0])[:64]}': send back what the last reply gave"
-            )
-        belongs_to = state.get(BELONGS_TO)
-        if belongs_to is None:
-            return cls(arrays, last_action=state.get(LAST_ACTION))
-        if type(belongs_to) is not str:
-            raise RequestError(f"the state's '{BELONGS_TO}' must be the string from the last reply")
-        identity, mark = split_identity(belongs_to)
-        return cls(arrays, policy_identity=identity, last_action=state.get(LAST_ACTION), mark=mark)
+    arrays: Mapping[str, Any]  # by state name
+    policy_identity: str | None  # of the policy that produced the state; None if the client has dropped it
+    last_action: Any
+    mark: EpisodeStep | None  # of the step in a recording
 
 
-NO_STATE = CarriedState({}, is_empty=True)
+def parse_state(state: Mapping[str, Any]) -> CarriedState:
+    """Return the parts of a request's state. Raises RequestError."""
+    arrays = {name: value for name, value in state.items() if not str(name).startswith(MARK)}
+    unknown = [name for name in state if name not in arrays and name not in (BELONGS_TO, LAST_ACTION)]
+    if unknown:
+        raise RequestError(
+            f"the state has the unknown entry '{str(unknown[0])[:64]}': send back what the last reply gave"
+        )
+    belongs_to = state.get(BELONGS_TO)
+    if belongs_to is not None and type(belongs_to) is not str:
+        raise RequestError(f"the state's '{BELONGS_TO}' must be the string from the last reply")
+    identity, mark = (None, None) if belongs_to is None else split_identity(belongs_to)
+    return CarriedState(arrays, identity, state.get(LAST_ACTION), mark)
 
 
 def split_identity(belongs_to: str) -> tuple[str, EpisodeStep | None]:

@@ -8,13 +8,14 @@ right. A state only reaches the version that it belongs to. A refused request do
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
-from rlservo.serve_app.episodes.carried_state import NO_STATE, CarriedState, carry, split_identity
+from rlservo.serve_app.episodes.carried_state import carry, parse_state, split_identity
 from rlservo.serve_app.episodes.memory_sessions import MemorySessions, shorten
-from rlservo.serve_app.episodes.request import Episode, Request, SessionId, new_episode_id
+from rlservo.serve_app.episodes.request import Request, SessionId, new_episode_id
 from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.runtime.policy import Policy, Step
 from rlservo.serve_app.versions.policy_store import (
@@ -65,14 +66,8 @@ class Episodes:
         SessionLostError, RequestError, UnavailableError if there is no room or the store cannot be reached, and what
         `Policy.step` raises; the recurrent state has then not changed.
         """
-        episode, stream = request.episode, request.stream
-        if episode is None:
-            return (
-                _act_alone(store, request)
-                if stream is None
-                else self._act_on_stream(store, request, NO_EPISODE, stream)
-            )
-        if episode.final_status is not None and (episode.reset or (episode.state is not None and not episode.state)):
+        episode = request.episode
+        if episode.final_status is not None and episode.begins:
             raise RequestError(
                 "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): "
                 "report how the last one ended in a separate request before it"
@@ -80,17 +75,16 @@ class Episodes:
         if episode.session_id is not None:
             request.label = str(episode.session_id)
             if store.remembers(request.policy):
-                return await self._act_in_session(store, request, episode, episode.session_id)
+                return await self._act_in_session(store, request, episode.session_id)
             # There is nothing to remember: the id only groups requests.
-            episode = replace(episode, session_id=None, reset=False, end=False)
-        if episode.end or (episode.reset and request.stream_id is None):
+        elif episode.end or (episode.reset and request.stream_id is None):
             word = "end" if episode.end else "reset"
             raise RequestError(f"'{word}' needs a session: also send its 'session_id'")
         if episode.state is not None:
-            return self._act_from_carried(store, request, episode)
-        if stream is not None:
-            return self._act_on_stream(store, request, episode, stream)
-        return _act_alone(store, request, episode)
+            return self._act_from_carried(store, request, episode.state)
+        if request.stream is not None:
+            return self._act_on_stream(store, request, request.stream)
+        return _act_alone(store, request)
 
     def policy_of(
         self, store: PolicyStore, name: str, version: str | None, session_id: SessionId | None, identity: Any
@@ -102,16 +96,15 @@ class Episodes:
         own = store.find(name, split_identity(identity)[0]) if type(identity) is str and version is None else None
         return own or store.get(name, version)
 
-    def _act_from_carried(self, store: PolicyStore, request: Request, episode: Episode) -> Decision:
+    def _act_from_carried(self, store: PolicyStore, request: Request, state: Mapping[str, Any]) -> Decision:
         """Act from a state in the request, with the version that it belongs to."""
         name, version, stream = request.policy, request.version, request.stream
-        assert episode.state is not None
-        carried = CarriedState.parse(episode.state)
+        carried = parse_state(state)
         if carried.policy_identity is not None:
             policy = _owner(store, request, carried.policy_identity)
         else:
             policy = _choose(store, request)
-            if stream is not None and not carried.is_empty and store.has(stream.policy) and version is None:
+            if stream is not None and state and store.has(stream.policy) and version is None:
                 policy = stream.policy
             if carried.arrays and policy.contract.state and not store.is_certain(name, version):
                 raise RequestError(
@@ -120,54 +113,44 @@ class Episodes:
                     f"reply's whole state ('{BELONGS_TO}' in 'state', or the parameter 'state_policy'), or name the "
                     "version in the URL"
                 )
-        needs_last = policy.has_step_limit and not carried.is_empty
-        if needs_last and carried.last_action is None and episode.last_action is None:
-            raise StateNeededError(f"policy '{name}' {NEEDS_LAST}")
-        decision, step = _take_step(policy, request, episode, carried)
+        if state:
+            _check_last_action(policy, request, carried.last_action)
+        given = carried.arrays if carried.arrays or (policy.contract.state and state) else None
+        decision, step = _take_step(policy, request, state=given, last_action=carried.last_action)
         if policy.is_stateful:
-            mark = self._mark(carried, request) if self.marks_states else None
-            next_mark = None if mark is None else EpisodeStep(mark.episode, mark.step + 1)
+            mark = next_mark = None
+            if self.marks_states:  # one without a mark is unknown, but not an episode's first
+                mark = carried.mark or EpisodeStep(new_episode_id(request.label), 1 if state else 0)
+                next_mark = EpisodeStep(mark.episode, mark.step + 1)
             decision.episode = EpisodeNote(state=carry(policy, step, next_mark), recorded_step=mark)
         return decision
 
-    def _mark(self, carried: CarriedState, request: Request) -> EpisodeStep:
-        """Return which step of which episode of the recording this is."""
-        if carried.is_empty:
-            return EpisodeStep(new_episode_id(request.label), 0)
-        return carried.mark or EpisodeStep(new_episode_id(request.label), 1)  # unknown, but not the first
-
-    def _act_on_stream(self, store: PolicyStore, request: Request, episode: Episode, stream: Session) -> Decision:
+    def _act_on_stream(self, store: PolicyStore, request: Request, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
-        policy, begins = stream.policy, episode.reset
-        if begins:
-            policy = _choose(store, request)
+        before = stream
+        if request.episode.reset:
+            before = Session(_choose(store, request))
         else:
-            _check_version(store, request, policy, "this stream's episode")
-        decision, step = _take_step(policy, request, episode, session=Session(policy) if begins else stream)
-        rows = step.rows if policy.is_stateful else 0
-        if rows != stream.rows:
-            self.sessions.reserve(stream, rows)
-        if begins:
-            stream.begin(policy)
-        stream.keep(step)
+            _check_version(store, request, stream.policy, "this stream's episode")
+        decision, step = _take_step(before.policy, request, before=before.state, last=before.last)
+        self.sessions.reserve(stream, step.rows if before.policy.is_stateful else 0)
+        stream.policy, stream.state, stream.last = before.policy, step.state or None, step.leaves
+        stream.steps = before.steps + 1
         decision.episode = EpisodeNote(step=stream.steps)
         return decision
 
-    async def _act_in_session(
-        self, store: PolicyStore, request: Request, episode: Episode, session_id: SessionId
-    ) -> Decision:
+    async def _act_in_session(self, store: PolicyStore, request: Request, session_id: SessionId) -> Decision:
         """Act from the state stored under the request's id."""
-        name = request.policy
-        if episode.state is not None:
+        if request.episode.state is not None:
             raise RequestError("the request has both 'state' and 'session_id': send one of them")
         if not self._has_sessions:
             raise RequestError(NO_SHARED_SESSIONS)
         try:
             decision = await (self.store or self.sessions).act(store, request, session_id, self._step_session)
         except SessionLostError:
-            self.lost[name] += 1
+            self.lost[request.policy] += 1
             raise
-        self.begun[name] += episode.reset
+        self.begun[request.policy] += request.episode.reset
         return decision
 
     def _step_session(self, store: PolicyStore, request: Request, session: Session | None) -> tuple[Decision, Session]:
@@ -176,26 +159,32 @@ class Episodes:
         If the last request is repeated, the session has already answered it, and is returned unchanged.
         """
         episode, seq = request.episode, request.seq
-        assert episode is not None and episode.session_id is not None
+        assert episode.session_id is not None
         if episode.reset:
             session = Session(_choose(store, request))
         else:
             if session is None:
                 raise self._lost(request, episode.session_id)
-            _check_version(store, request, session.policy, f"session '{shorten(episode.session_id)}'")
-            repeated = session.answer_again(seq, request.obs)
-            if repeated is not None:
-                return repeated, session
+            policy = session.policy
+            _check_version(store, request, policy, f"session '{shorten(episode.session_id)}'")
+            if session.has_answered(seq, request.obs):
+                action = policy.build_action(session.last or {}, batch=session.batch is not None)
+                contract, notices = policy.contract, tuple(session.notices)
+                decision = Decision(
+                    action, policy, {}, contract.name, contract.version, session.infer_ms, session.batch, notices,
+                    EpisodeNote(session_id=episode.session_id, step=session.steps), is_repeat=True,
+                )  # fmt: skip
+                return decision, session
             if session.is_ended:
                 raise self._lost(request, episode.session_id)
-        policy = session.policy
-        decision, step = _take_step(policy, request, episode, session=session)
-        after = Session(policy, steps=session.steps, rows=step.rows, begun=session.begun, seq=seq, is_ended=episode.end)
-        after.keep(step)
+        decision, step = _take_step(session.policy, request, before=session.state, last=session.last)
+        inputs_hash = b"" if seq is None else session.policy.fingerprint(step.inputs)
+        after = replace(
+            session, state=step.state or None, last=step.leaves, steps=session.steps + 1, rows=step.rows,
+            is_ended=episode.end, seq=seq, inputs_hash=inputs_hash, infer_ms=decision.infer_ms, batch=decision.batch,
+            notices=decision.notices,
+        )  # fmt: skip
         decision.episode = EpisodeNote(session_id=episode.session_id, step=after.steps)
-        if seq is not None:  # without the inputs: they may be views of a whole request's body
-            after.answer = replace(decision, inputs={}, is_repeat=True)
-            after.inputs_hash = policy.fingerprint(step.inputs)
         return decision, after
 
     def _lost(self, request: Request, session_id: SessionId) -> SessionLostError:
@@ -207,22 +196,24 @@ class Episodes:
         )
 
 
-NO_EPISODE = Episode()
-
-
-def _act_alone(store: PolicyStore, request: Request, episode: Episode = NO_EPISODE) -> Decision:
+def _act_alone(store: PolicyStore, request: Request) -> Decision:
     """Act for a request that needs nothing from earlier ones."""
     policy = _choose(store, request)
     if policy.contract.state:
         raise StateNeededError(f"policy '{request.policy}' {NEEDS_STATE}")
-    if policy.has_step_limit and episode.last_action is None:
-        raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
-    return _take_step(policy, request, episode)[0]
+    _check_last_action(policy, request, None)
+    return _take_step(policy, request)[0]
 
 
 def _choose(store: PolicyStore, request: Request) -> Policy:
     """Return the policy for a request without one."""
     return store.choose(request.policy, request.version, request.label)
+
+
+def _check_last_action(policy: Policy, request: Request, last_action: Any) -> None:
+    """Raise StateNeededError if a limited step has no last action to count from."""
+    if policy.has_step_limit and last_action is None and request.episode.last_action is None:
+        raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
 
 
 def _owner(store: PolicyStore, request: Request, identity: str) -> Policy:
@@ -251,23 +242,15 @@ def _check_version(store: PolicyStore, request: Request, policy: Policy, memory:
         )
 
 
-def _take_step(
-    policy: Policy,
-    request: Request,
-    episode: Episode,
-    carried: CarriedState = NO_STATE,
-    *,
-    session: Session | None = None,
-) -> tuple[Decision, Step]:
-    """Take a step from the client's state, or from a session's."""
+def _take_step(policy: Policy, request: Request, *, last_action: Any = None, **memory: Any) -> tuple[Decision, Step]:
+    """Take a step from `memory`, as `Policy.step` takes it; a last action in the request precedes `last_action`."""
+    episode = request.episode
     return take_step(
         policy,
         request.obs,
-        before=None if session is None else session.state,
-        last=None if session is None else session.last,
-        state=carried.arrays if carried.arrays or (policy.contract.state and not carried.is_empty) else None,
-        last_action=carried.last_action if episode.last_action is None else episode.last_action,
+        last_action=last_action if episode.last_action is None else episode.last_action,
         reward=episode.reward,
         explore=request.explore,
         seed=request.seed,
+        **memory,
     )

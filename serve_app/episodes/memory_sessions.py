@@ -64,9 +64,7 @@ class MemorySessions:
         if after.is_ended:
             self.end(*key)
             return decision
-        more = after.rows - (0 if before is None else before.rows)
-        self._check_room(more)
-        self.rows += more
+        self._count(after.rows - (0 if before is None else before.rows))
         after.connection, after.used = request.connection, time.monotonic()
         self._sessions[key] = after
         self._sessions.move_to_end(key)
@@ -79,18 +77,14 @@ class MemorySessions:
             self.rows -= session.rows
 
     def reserve(self, stream: Session, rows: int) -> None:
-        """Reserve places for a stream's episodes. Raises UnavailableError, and then changes nothing."""
-        self._evict()
-        self._check_room(rows - stream.rows)
-        self.rows += rows - stream.rows
-        stream.rows = rows
+        """Change the number of a stream's episodes. Raises UnavailableError, and then changes nothing."""
+        if rows != stream.rows:
+            self._evict()
+            self._count(rows - stream.rows)
+            stream.rows = rows
 
-    def release(self, stream: Session) -> None:
-        """Release the places of a stream's episodes."""
-        self.rows -= stream.rows
-        stream.rows = 0
-
-    def _check_room(self, more: int) -> None:
+    def _count(self, more: int) -> None:
+        """Count more episodes in memory. Raises UnavailableError if there is no room."""
         if more > 0 and self.rows + more > self._most:
             what = "another episode" if more == 1 else f"{more} more episodes (one per row of the batch)"
             raise UnavailableError(
@@ -99,6 +93,7 @@ class MemorySessions:
                 "request",
                 {"episodes": self.rows, "most": self._most},
             )
+        self.rows += more
 
     def _evict(self) -> None:
         oldest = time.monotonic() - self._idle_s
@@ -113,7 +108,7 @@ class MemorySessions:
 def overtaken(request: Request, session_id: SessionId) -> RlservoError:
     """Return the error for a request whose session was begun again meanwhile."""
     shown = f"session '{shorten(session_id)}' of policy '{request.policy[:64]}'"
-    if request.episode is not None and request.episode.reset:
+    if request.episode.reset:
         return UnavailableError(f"another request started {shown} at the same time: try again")
     return SessionError(f"the request belongs to an earlier episode: another one has restarted {shown} since")
 

@@ -29,7 +29,7 @@ from rlservo.export.contract.errors import OverloadedError, UnavailableError, Us
 from rlservo.serve_app.episodes.memory_sessions import StepSession, overtaken
 from rlservo.serve_app.episodes.request import Request, SessionId, check_client, check_deadline
 from rlservo.serve_app.episodes.session import Session
-from rlservo.serve_app.versions.policy_store import Decision, EpisodeNote, PolicyStore
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 logger = logging.getLogger(__name__)
@@ -45,8 +45,7 @@ if now == ARGV[1] then redis.call('SET', KEYS[1], ARGV[2], 'PX', ARGV[3]) end
 return now == ARGV[1] or now == string.sub(ARGV[2], 1, {STAMP_BYTES})
 """
 
-FIELDS = ("state", "last", "steps", "begun", "seq", "inputs_hash", "is_ended")
-ANSWER_FIELDS = ("infer_ms", "batch", "notices")  # in a `Decision`: its action is the session's last
+FIELDS = ("state", "last", "steps", "begun", "is_ended", "seq", "inputs_hash", "infer_ms", "batch", "notices")
 
 
 class RedisSessions:
@@ -78,26 +77,24 @@ class RedisSessions:
         """Decide for a request of a session, as `Sessions.act`. Also raises DeadlineError."""
         named = json.dumps([request.policy, session_id]).encode()
         key = "rlservo:session:" + hashlib.blake2b(named, digest_size=16).hexdigest()
-        stamp, run, session = await self._load(key, store, request, session_id)
+        stamp, run, session = await self._load(key, store, request)
         begun = None if session is None else session.begun
         while True:
             decision, after = step_session(store, request, session)
             content = os.urandom(STAMP_BYTES) + _pack(after, run)
             if decision.is_repeat or await self._call(request, self._write, key, stamp, content, self._idle_ms):
                 return decision
-            stamp, run, session = await self._load(key, store, request, session_id)
+            stamp, run, session = await self._load(key, store, request)
             if session is not None and session.begun != begun:
                 raise overtaken(request, session_id)
 
-    async def _load(
-        self, key: str, store: PolicyStore, request: Request, session_id: SessionId
-    ) -> tuple[bytes, bytes, Session | None]:
+    async def _load(self, key: str, store: PolicyStore, request: Request) -> tuple[bytes, bytes, Session | None]:
         """Return (stamp, Redis's run, session). Also raises ClientGoneError."""
         record, run = await self._call(request, self._read, key)
         await check_client(request)  # after the read: it lacks later requests, or the client has hung up
         if record is None:
             return b"", run, None
-        return record[:STAMP_BYTES], run, _unpack(record[STAMP_BYTES:], store, request.policy, session_id, run)
+        return record[:STAMP_BYTES], run, _unpack(record[STAMP_BYTES:], store, request.policy, run)
 
     async def close(self) -> None:
         """Close the connections."""
@@ -129,29 +126,11 @@ def _pack(session: Session, run: bytes) -> bytes:
     fields = {name: getattr(session, name) for name in FIELDS}
     if session.is_ended:
         fields["state"] = None
-    answer = session.answer
-    if answer is not None:
-        fields["answer"] = {name: getattr(answer, name) for name in ANSWER_FIELDS}
     return pack({"run": run, "identity": session.policy.identity, **fields})
 
 
-def _unpack(content: bytes, store: PolicyStore, name: str, session_id: SessionId, run: bytes) -> Session | None:
+def _unpack(content: bytes, store: PolicyStore, name: str, run: bytes) -> Session | None:
     """Return a session; None if it was written in another run of Redis, or its policy is not loaded."""
     fields = unpack(content)
     policy = store.find(name, fields.pop("identity"))
-    if fields.pop("run") != run or policy is None:
-        return None
-    answer = fields.pop("answer", None)
-    session = Session(policy, **fields)
-    if answer is not None:
-        session.answer = Decision(
-            policy.build_action(fields["last"], batch=answer["batch"] is not None),
-            policy,
-            {},
-            name,
-            policy.contract.version,
-            **{**answer, "notices": tuple(answer["notices"])},
-            episode=EpisodeNote(session_id=session_id, step=session.steps),
-            is_repeat=True,
-        )
-    return session
+    return None if fields.pop("run") != run or policy is None else Session(policy, **fields)

@@ -51,8 +51,15 @@ class Episode:
     truncated: bool = False  # whether it was cut off, as by a time limit
     last_action: Any = None  # the robot's last command, if the step from it is limited
 
+    @property
+    def begins(self) -> bool:
+        """Whether it is the episode's first request."""
+        return self.reset or (self.state is not None and not self.state)
+
 
 EPISODE_FIELDS = frozenset(each.name for each in fields(Episode))
+NO_EPISODE = Episode()
+"""Of a request with none of its fields."""
 
 
 @dataclass(slots=True)
@@ -103,7 +110,7 @@ class Request:
     """[ms] After `received`; a request that is late by then is not computed."""
     timestamp: float | None = None
     """[s] The client's clock, echoed in the reply."""
-    episode: Episode | None = None
+    episode: Episode = NO_EPISODE
     non_finite: bool = False
     """Whether its JSON held NaN or Infinity, which JSON does not have."""
     reply_options: Any = None

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import SessionError
-from rlservo.serve_app.runtime.policy import Policy, Step
+from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.runtime.recurrent_state import State
-from rlservo.serve_app.versions.policy_store import Decision
 
 
 @dataclass(slots=True)
@@ -27,40 +26,28 @@ class Session:
     used: float = field(default_factory=time.monotonic)
     begun: float = field(default_factory=time.perf_counter)  # number of the episode, unique for its id
     connection: Any = None  # of the last request
-    seq: int | None = None  # of the last request that was answered
+    is_ended: bool = False  # kept only to answer its last request again
+    # Of the last request:
+    seq: int | None = None
     inputs_hash: bytes = b""  # of its observation
-    answer: Decision | None = None  # to the last request, in case it is sent again; None if it had no `seq`
-    is_ended: bool = False  # kept only for its answer
+    infer_ms: float = 0.0
+    batch: int | None = None
+    notices: tuple[str, ...] = ()
 
-    def keep(self, step: Step) -> None:
-        """Store a step's outcome."""
-        self.state = step.state or None
-        self.last = step.leaves
-        self.steps += 1
-
-    def begin(self, policy: Policy) -> None:
-        """Forget everything: the next step is an episode's first."""
-        self.policy = policy
-        self.state = self.last = None
-        self.steps = 0
-
-    def answer_again(self, seq: int | None, obs: Any) -> Decision | None:
-        """Return the last request's answer if this is the same request again (because its reply was lost).
+    def has_answered(self, seq: int | None, obs: Any) -> bool:
+        """Return whether this is the last request again (because its reply was lost).
 
         Computing it twice would advance the recurrent state twice. Raises SessionError for a request out of order, and
         for a different one with the last one's number: the old answer would be an action for a past observation.
         """
         if seq is None or self.seq is None or seq > self.seq:
-            return None
+            return False
+        fault = f"came after request {self.seq} of this session was answered: send requests in order"
         if seq == self.seq:
             if self.policy.fingerprint(self.policy.parse(obs).arrays) == self.inputs_hash:
-                return self.answer
-            raise SessionError(
-                f"request {seq} of this session was already answered, for another observation: give every request a "
-                "larger 'seq' than the one before, or none",
-                {"seq": seq, "last_seq": self.seq},
+                return True
+            fault = (
+                "of this session was already answered, for another observation: give every request a larger 'seq' than "
+                "the one before, or none"
             )
-        raise SessionError(
-            f"request {seq} came after request {self.seq} of this session was answered: send requests in order",
-            {"seq": seq, "last_seq": self.seq},
-        )
+        raise SessionError(f"request {seq} {fault}", {"seq": seq, "last_seq": self.seq})

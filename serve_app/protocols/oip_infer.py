@@ -26,7 +26,7 @@ from typing_extensions import Required, TypedDict
 from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
 from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, Episode, Request, reply_fields
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, NO_EPISODE, Episode, Request, reply_fields
 from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
 from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type, too_large
 from rlservo.serve_app.protocols.json_text import parse_json
@@ -191,7 +191,7 @@ def fill(handler: RequestHandler, request: Request, document: Mapping[str, Any],
     parameters: Parameters = parse_fields(PARAMETERS, given.get("parameters") or {}, "parameter")
     timeout_us, transport_ms = parameters.get("timeout"), request.deadline_ms
     request.deadline_ms = timeout_us / 1e3 if timeout_us else None
-    outcome = fill_request(request, parameters) or Episode()
+    outcome = fill_request(request, parameters)
     if transport_ms is not None:
         request.deadline_ms = transport_ms if request.deadline_ms is None else min(request.deadline_ms, transport_ms)
     sequence = parameters.get("sequence_id") or None
@@ -285,7 +285,7 @@ def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
 
 def _episode(
     contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Parameters, outcome: Episode
-) -> Episode | None:
+) -> Episode:
     """Return the episode fields of the inputs and parameters."""
     states: dict[str, Any] = {
         name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
@@ -302,7 +302,7 @@ def _episode(
         reward=inputs.get(REWARD, outcome.reward),
         last_action=_last_action(contract, inputs),
     )
-    return None if all(getattr(episode, field.name) is field.default for field in fields(Episode)) else episode
+    return NO_EPISODE if all(getattr(episode, field.name) is field.default for field in fields(Episode)) else episode
 
 
 def _last_action(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:

@@ -15,7 +15,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_confi
 from typing_extensions import TypedDict
 
 from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.episodes.request import EPISODE_FIELDS, LONGEST_SESSION_ID, Episode, Request
+from rlservo.serve_app.episodes.request import EPISODE_FIELDS, LONGEST_SESSION_ID, NO_EPISODE, Episode, Request
 from rlservo.serve_app.protocols.json_text import json_type
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
@@ -103,8 +103,8 @@ def parse_fields(kind: TypeAdapter[Any], document: Mapping[Any, Any], what: str 
     raise RequestError(f"'{place}' must {expected}, got {json_type(first['input'])}")
 
 
-def fill_request(request: Request, given: Mapping[str, Any]) -> Episode | None:
-    """Set a request's options to checked fields; return those of its episode, None if there are none."""
+def fill_request(request: Request, given: Mapping[str, Any]) -> Episode:
+    """Set a request's options to checked fields; return those of its episode."""
     said = {}
     for name, value in given.items():
         if value is not None:
@@ -112,4 +112,4 @@ def fill_request(request: Request, given: Mapping[str, Any]) -> Episode | None:
                 said[name] = value
             elif name in Options.__optional_keys__:
                 setattr(request, name, value)
-    return Episode(**said) if said else None
+    return Episode(**said) if said else NO_EPISODE

@@ -114,7 +114,7 @@ class StreamEndpoint:
         finally:
             conversation.timer.cancel()
             if opening.stream is not None:
-                handler.episodes.sessions.release(opening.stream)
+                handler.episodes.sessions.reserve(opening.stream, 0)
             handler.close_stream(opening)
 
     def _address(self, params: Mapping[str, str]) -> tuple[str, str | None]:

@@ -6,23 +6,19 @@ our own and bounded, so that a storage which sends too much or too slowly is ref
 
 from __future__ import annotations
 
-import functools
 import io
 import os
 import re
-import ssl
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 from urllib.parse import quote, urlsplit
 
-import httpcore
-
 from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
 from rlservo.export.contract.extras import install
 from rlservo.serve_app.repository.storage import TIMEOUT_S, place_of
-from rlservo.serve_app.wire.bounded_http import FAILURES, MOST_HELD, DeadlineBackend, connection_pool
+from rlservo.serve_app.wire.bounded_http import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool
 
 PAGE = 2 << 20  # [bytes] of a list: 1,000 names of at most 1,024 bytes
 MOST_PAGES = 100
@@ -133,7 +129,7 @@ class ObjectStorage:
             except _TooLongError:
                 kind = UnavailableError if method == "list_objects_v2" else BundleError
                 raise kind(f"{place}: the storage sends more than the {most:,} bytes that it may") from None
-            except httpcore.TimeoutException:
+            except TIMEOUTS:
                 raise UnavailableError(
                     f"{place} gave no answer within {self.timeout_s:.0f} s, or too slow a one"
                 ) from None
@@ -152,25 +148,21 @@ class ObjectStorage:
     ) -> Reply:
         """Put a body or get one; write that of a success, never unpacked, into `into`.
 
-        Raises _TooLongError beyond `most` bytes, and httpcore's errors: TimeoutException when connecting takes longer
+        Raises _TooLongError beyond `most` bytes, and httpcore's errors, or TIMEOUTS when connecting takes longer
         than the time-out, or the rest longer than that plus the time that the received bytes take at `SLOWEST`.
         """
         backend = DeadlineBackend()
-        backend.deadline = deadline = time.monotonic() + self.timeout_s + len(body or b"") / SLOWEST
-        content = None
-        if body is not None:
-            headers = {"Content-Length": str(len(body)), **headers}
-            content = (body[start : start + MOST_HELD] for start in range(0, len(body), MOST_HELD))
-        waits = {"timeout": dict.fromkeys(("connect", "read", "write"), self.timeout_s)}
+        backend.deadline.at = deadline = time.monotonic() + self.timeout_s + len(body or b"") / SLOWEST
+        waits = {"timeout": dict.fromkeys(("connect", "read"), self.timeout_s)}
         method, length, refusal = "GET" if body is None else "PUT", 0, b""
         with (
-            connection_pool(url, backend, lambda: _trusted(os.environ.get("AWS_CA_BUNDLE") or None)) as pool,
-            pool.stream(method, url, headers=headers, content=content, extensions=waits) as reply,
+            connection_pool(url, backend, os.environ.get("AWS_CA_BUNDLE")) as pool,
+            pool.stream(method, url, headers=headers, content=body, extensions=waits) as reply,
         ):
             found = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in reply.headers}
             for block in reply.iter_stream():
                 length += len(block)
-                backend.deadline = deadline + length / SLOWEST
+                backend.deadline.at = deadline + length / SLOWEST
                 if 200 <= reply.status < 300:
                     if length > most:
                         raise _TooLongError
@@ -208,11 +200,6 @@ class ObjectStorage:
             place = reply.headers.get("x-amz-bucket-region") or reply.headers.get("location", "").partition("?")[0]
             said = f"is redirected to {_hidden(place)}, which is not followed"
         raise UnavailableError(f"{self.uri}/{name} {said}")
-
-
-@functools.cache
-def _trusted(certificates: str | None) -> ssl.SSLContext:
-    return ssl.create_default_context(cafile=certificates)
 
 
 def _hidden(text: str) -> str:

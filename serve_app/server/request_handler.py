@@ -26,7 +26,7 @@ from rlservo.export.contract.errors import (
     UnavailableError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
-from rlservo.serve_app.episodes.request import ClientGoneError, Episode, Request, check_deadline
+from rlservo.serve_app.episodes.request import NO_EPISODE, ClientGoneError, Request, check_deadline
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
@@ -149,7 +149,7 @@ class RequestHandler:
             codec.parse(request, content)
             if request.explore and not request.may_explore:
                 raise ForbiddenError(NO_EXPLORING)
-            if request.label is not None or request.episode is not None:
+            if request.label is not None or request.episode is not NO_EPISODE:
                 _check_names(request)
             if request.non_finite:
                 decision = await self._decide_non_finite(request)
@@ -169,7 +169,7 @@ class RequestHandler:
             raise InternalError(BUG) from error
         taken = time.perf_counter() - request.received
         self.metrics.record_answer(request.protocol, decision, taken)
-        if request.episode is not None and request.episode.final_status is not None:
+        if request.episode.final_status is not None:
             self._count_end(request, decision, request.episode.final_status)
         if self.recorder is not None:
             self.recorder.note_answer(request, decision, taken)
@@ -273,7 +273,7 @@ class RequestHandler:
 
     async def _decide_non_finite(self, request: Request) -> Decision:
         """Refuse numbers that JSON lacks, naming the element if it is one of the observation's."""
-        if request.episode is None:  # otherwise a session would advance
+        if request.episode is NO_EPISODE:  # otherwise a session would advance
             try:
                 await self.decide(request)
             except ObservationError as error:
@@ -288,11 +288,11 @@ class RequestHandler:
 
 def _check_names(request: Request) -> None:
     """Refuse an API key in an episode's name or end, which would reach recordings, metrics and logs."""
-    episode = request.episode or Episode()
+    episode = request.episode
     said = {"x-session-id": request.label, "session_id": episode.session_id, "final_status": episode.final_status}
     for name, text in said.items():
         if type(text) is str and A_KEY.search(text):
-            request.label = request.episode = None
+            request.label, request.episode = None, NO_EPISODE
             raise RequestError(f"'{name}' holds an API key, which would be recorded: send another name")
 
 

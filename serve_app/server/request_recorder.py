@@ -40,7 +40,6 @@ logger = logging.getLogger(__name__)
 
 MOST_EPISODES = 65_536  # whose steps are counted; beyond it, the one that was silent longest starts over
 LONGEST_REQUEST_ID = 128  # longer ones are cut: a header may have 16 KB
-NO_EPISODE = Episode()
 
 
 class RequestRecorder:
@@ -97,7 +96,7 @@ class RequestRecorder:
 
     def _record_answer(self, request: Request, decision: Decision, taken_s: float, draw: Draw | None) -> None:
         policy = decision.policy
-        said = request.episode or NO_EPISODE
+        said = request.episode
         episode, step = self._place(request, decision, said)
         known, rows = self._format(policy), decision.batch or 1
         # Copies: binary input is a view of the whole request's body, which may be a thousand times as large.
@@ -126,7 +125,7 @@ class RequestRecorder:
         self.recorder.record(record)
 
     def _record_failure(self, request: Request, store: PolicyStore, code: str, taken_ms: float) -> None:
-        said = request.episode or NO_EPISODE
+        said = request.episode
         if said.final_status is not None:
             return  # no decision was requested; the episode continues until its end is reported
         session_id = said.session_id
@@ -145,8 +144,9 @@ class RequestRecorder:
             arrays = known.observations.arrays(request.obs)
         except Exception:  # it may be anything: it has not been checked yet
             return
-        episode = "" if _carries_state(request) else _episode_of(request)
-        step = self._count(policy.contract.name, episode, said.reset) if episode else 0
+        carries_state = policy.is_stateful and said.state is not None
+        episode = "" if carries_state else _episode_of(request)
+        step = self._count(policy.contract.name, episode, said.begins) if episode else 0
         record = DecisionRecord(
             known, LeafArrays({name: array.copy() for name, array in arrays.items()}), None, episode, step, taken_ms,
             request.explore, seq=request.seq, request_id=_request_id(request), error=code,
@@ -163,7 +163,7 @@ class RequestRecorder:
             return "", 0
         # A memory that continues does not begin an episode, even if its end was reported or it was forgotten here.
         least = note.step - 1 if note is not None and note.step is not None and decision.policy.is_stateful else 0
-        step = self._count(decision.name, episode, said.reset, least)
+        step = self._count(decision.name, episode, said.begins, least)
         if said.end or said.final_status is not None:
             del self._steps[decision.name, episode]
         return episode, step
@@ -192,10 +192,8 @@ def _episode_of(request: Request) -> str:
 
 
 def _session_of(request: Request) -> str | None:
-    if request.episode is None or request.episode.session_id is None:
-        return None
     session_id = request.episode.session_id
-    return session_id if isinstance(session_id, str) else f"#{session_id}"  # 7 and "7" are different sessions
+    return f"#{session_id}" if isinstance(session_id, int) else session_id  # 7 and "7" are different sessions
 
 
 def _request_id(request: Request) -> str | None:
@@ -209,7 +207,3 @@ def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:
     except RequestError:
         return None
     return numbers if len(numbers) in (1, rows) and np.isfinite(numbers).all() else None
-
-
-def _carries_state(request: Request) -> bool:
-    return request.episode is not None and request.episode.state is not None

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Mapping
-from urllib.parse import SplitResult, urlsplit
+from urllib.parse import quote, urlsplit
 
 from rlservo.export.contract.errors import UsageError
+
+PATH_CHARACTERS = "/%:@!$&'()*+,;=~"  # of a path, kept as given
 
 
 def is_loopback(host: str) -> bool:
@@ -20,20 +22,18 @@ def is_loopback(host: str) -> bool:
 
 
 def parse_address(url: str, schemes: Mapping[str, str]) -> str:
-    """Return `url` with its scheme replaced by `schemes`, without a trailing slash. Raises UsageError."""
+    """Return `url` in ASCII, with its scheme replaced by `schemes`, without a user and a trailing slash.
+
+    Raises UsageError.
+    """
     parts = urlsplit(url)
     try:
-        has_host = bool(parts.hostname) and parts.port != 0
-        host_of(parts)  # UnicodeError, a ValueError: a name that cannot be encoded
-    except ValueError:
-        has_host = False
-    if parts.scheme not in schemes or not has_host:
+        host, port = (parts.hostname or "").encode("idna").decode(), parts.port
+    except ValueError:  # a port beyond 65535, or (UnicodeError) a name that cannot be encoded
+        host, port = "", None
+    if parts.scheme not in schemes or not host or port == 0:
         raise UsageError(f"{url!r} is not a server address: expected for example 'http://127.0.0.1:8000'")
     if parts.query or parts.fragment:
         raise UsageError(f"{url!r} has a query or fragment: expected only scheme, host, port and path")
-    return parts._replace(scheme=schemes[parts.scheme]).geturl().rstrip("/")
-
-
-def host_of(parts: SplitResult) -> bytes:
-    """Return a host in its encoded form."""
-    return (parts.hostname or "").encode("idna")
+    place = (f"[{host}]" if ":" in host else host) + ("" if port is None else f":{port}")
+    return f"{schemes[parts.scheme]}://{place}{quote(parts.path, safe=PATH_CHARACTERS)}".rstrip("/")

@@ -16,14 +16,12 @@ def key_file(port: int) -> Path:
 
     Below XDG_RUNTIME_DIR, else in the user's cache, else (for a user without a home) in the folder for temporary files.
     """
-    name = f"admin-{port}.key"
     folder = os.environ.get("XDG_RUNTIME_DIR") or os.environ.get("XDG_CACHE_HOME")
-    if folder:
-        return Path(folder) / "rlservo" / name
     try:
-        return Path.home() / ".cache" / "rlservo" / name
+        place = Path(folder or Path.home() / ".cache") / "rlservo"
     except RuntimeError:
-        return Path(tempfile.gettempdir()) / f"rlservo-{os.getuid()}" / name
+        place = Path(tempfile.gettempdir()) / f"rlservo-{os.getuid()}"
+    return place / f"admin-{port}.key"
 
 
 def read_key(file: Path) -> str:

@@ -1,16 +1,18 @@
 """Bounded HTTP connections: one deadline over all reads and writes, through the environment's proxy.
 
-httpcore's time-outs apply to each read: a server that sends a byte now and then can delay a client indefinitely. The
-deadlines of a control loop and of a storage call are for the whole answer.
+httpcore's time-outs apply to each read and each piece of a write: a server that sends or takes a byte now and then can
+delay a client indefinitely. The deadlines of a control loop and of a storage call are for the whole answer.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 from urllib.parse import unquote, urlsplit
 from urllib.request import getproxies, proxy_bypass
@@ -18,50 +20,25 @@ from urllib.request import getproxies, proxy_bypass
 import httpcore
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.wire.addresses import host_of, is_loopback
+from rlservo.serve_app.wire.addresses import is_loopback
 
-PROXIES: dict[str, Callable[..., httpcore.ConnectionPool]] = {
-    "http": httpcore.HTTPProxy,
-    "https": httpcore.HTTPProxy,
-    "socks5": httpcore.SOCKSProxy,
-    "socks5h": httpcore.SOCKSProxy,
-}
 FAILURES = (
     httpcore.NetworkError,
     httpcore.ProtocolError,
     httpcore.ProxyError,
-    httpcore.TimeoutException,
     httpcore.UnsupportedProtocol,
 )
-MOST_HELD = 65536
-"""[bytes] Part of a request that is held back until it is complete."""
+TIMEOUTS = (TimeoutError, httpcore.TimeoutException)
+MOST_HELD = 65536  # [bytes] of a request, held back until it is complete
 
 
 class DeadlineBackend(httpcore.NetworkBackend):
-    """Makes connections that give up at `deadline`, which is set per thread."""
+    """Makes connections that give up at a deadline, which each thread sets for its exchange."""
 
     def __init__(self) -> None:
         self._backend = httpcore.SyncBackend()
-        self._local = threading.local()
+        self.deadline = _Deadline()
         self.connections = 0
-
-    @property
-    def deadline(self) -> float | None:
-        """End of this thread's exchange (`time.monotonic`); None leaves httpcore's own time-outs."""
-        return getattr(self._local, "deadline", None)
-
-    @deadline.setter
-    def deadline(self, value: float | None) -> None:
-        self._local.deadline = value
-
-    def remaining(self, timeout: float | None, kind: type[Exception]) -> float | None:
-        """Return the time left before `timeout` and the deadline; raise `kind` if none is left."""
-        if self.deadline is None:
-            return timeout
-        remaining_s = self.deadline - time.monotonic()
-        if remaining_s <= 0:
-            raise kind("the deadline has passed")
-        return remaining_s if timeout is None else min(remaining_s, timeout)
 
     def connect_tcp(
         self,
@@ -72,55 +49,79 @@ class DeadlineBackend(httpcore.NetworkBackend):
         socket_options: Iterable[Any] | None = None,
     ) -> httpcore.NetworkStream:
         """Connect."""
-        remaining_s = self.remaining(timeout, httpcore.ConnectTimeout)
-        stream = self._backend.connect_tcp(host, port, remaining_s, local_address, socket_options)
+        stream = self._backend.connect_tcp(host, port, self.deadline.left(timeout), local_address, socket_options)
         self.connections += 1
-        return _DeadlineStream(stream, self)
-
-    def sleep(self, seconds: float) -> None:
-        """Sleep, as httpcore's own retries do."""
-        time.sleep(seconds)
+        return _DeadlineStream(stream, self.deadline)
 
 
 def connection_pool(
-    url: str, backend: DeadlineBackend, certificates: Callable[[], ssl.SSLContext], **options: Any
+    url: str, backend: DeadlineBackend, certificates: str | None, **options: Any
 ) -> httpcore.ConnectionPool:
     """Return a connection pool for a server, through the environment's proxy unless it is on this machine.
 
-    Raises UsageError for an unsupported kind of proxy.
+    The server's certificate is checked with those in the file `certificates`, by default the system's. Raises
+    UsageError for an unsupported kind of proxy.
     """
     server = urlsplit(url)
-    options["network_backend"] = backend
     # Reading the certificates takes 20 ms; http has no use for them.
-    options["ssl_context"] = certificates() if server.scheme in ("https", "wss") else None
+    options["ssl_context"] = _trusting(certificates or None) if server.scheme in ("https", "wss") else None
     is_direct = is_loopback(server.hostname or "") or proxy_bypass(server.netloc)
     proxy = None if is_direct else getproxies().get(server.scheme)
-    if proxy is None:
-        return httpcore.ConnectionPool(**options)
-    parts = urlsplit(proxy if "://" in proxy else f"http://{proxy}")
-    user = None if parts.username is None else (unquote(parts.username), unquote(parts.password or ""))
-    address = httpcore.URL(scheme=parts.scheme.encode(), host=host_of(parts), port=parts.port, target=b"/")
-    if parts.scheme not in PROXIES:
-        raise UsageError(
-            f"a proxy in the environment has the scheme {parts.scheme!r}: expected an address such as "
-            "'http://proxy:3128'"
-        )
-    return PROXIES[parts.scheme](address, user, **options)
+    if proxy is not None:
+        parts = urlsplit(proxy if "://" in proxy else f"http://{proxy}")
+        if parts.scheme != "http":
+            raise UsageError(
+                f"a proxy in the environment has the scheme {parts.scheme!r}: expected an address such as "
+                "'http://proxy:3128'"
+            )
+        user = None if parts.username is None else (unquote(parts.username), unquote(parts.password or ""))
+        options["proxy"] = httpcore.Proxy(f"http://{parts.netloc.rpartition('@')[2]}", user)
+    return httpcore.ConnectionPool(network_backend=backend, **options)
+
+
+def time_left(deadline: float) -> float:
+    """Return the seconds before a deadline (`time.monotonic`). Raises TimeoutError if it has passed."""
+    left_s = deadline - time.monotonic()
+    if left_s <= 0:
+        raise TimeoutError("the deadline has passed")
+    return left_s
+
+
+def send_all(connection: socket.socket, content: bytes, deadline: float) -> None:
+    """Send all of `content` by a deadline. Raises TimeoutError and OSError.
+
+    The time-outs of `sendall` over TLS and of httpcore's `write` begin again with each piece that the server takes.
+    """
+    rest = memoryview(content)
+    while rest:
+        connection.settimeout(time_left(deadline))
+        rest = rest[connection.send(rest) :]
+
+
+class _Deadline(threading.local):
+    """End of this thread's exchange."""
+
+    at = 0.0
+
+    def left(self, timeout: float | None) -> float:
+        """Return the seconds before it and before `timeout`. Raises TimeoutError."""
+        left_s = time_left(self.at)
+        return left_s if timeout is None else min(left_s, timeout)
 
 
 class _DeadlineStream(httpcore.NetworkStream):
     """Sends a request's head together with its body, which httpcore writes separately: the server reads only once."""
 
-    def __init__(self, stream: httpcore.NetworkStream, backend: DeadlineBackend) -> None:
+    def __init__(self, stream: httpcore.NetworkStream, deadline: _Deadline) -> None:
         self._stream = stream
-        self._backend = backend
+        self._deadline = deadline
         self._held = b""
 
     def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
         if self._held:
             with contextlib.suppress(httpcore.WriteError):  # as in httpcore: the server may have sent why it closed
                 self._send(timeout)
-        return self._stream.read(max_bytes, self._backend.remaining(timeout, httpcore.ReadTimeout))
+        return self._stream.read(max_bytes, self._deadline.left(timeout))
 
     def write(self, buffer: bytes, timeout: float | None = None) -> None:
         self._held += buffer
@@ -129,7 +130,13 @@ class _DeadlineStream(httpcore.NetworkStream):
 
     def _send(self, timeout: float | None) -> None:
         held, self._held = self._held, b""
-        self._stream.write(held, self._backend.remaining(timeout, httpcore.WriteTimeout))
+        end = time.monotonic() + self._deadline.left(timeout)
+        try:
+            send_all(self.get_extra_info("socket"), held, end)
+        except TimeoutError:
+            raise
+        except OSError as error:
+            raise httpcore.WriteError(str(error)) from error
 
     def close(self) -> None:
         self._stream.close()
@@ -137,8 +144,13 @@ class _DeadlineStream(httpcore.NetworkStream):
     def start_tls(
         self, ssl_context: ssl.SSLContext, server_hostname: str | None = None, timeout: float | None = None
     ) -> httpcore.NetworkStream:
-        remaining_s = self._backend.remaining(timeout, httpcore.ConnectTimeout)
-        return _DeadlineStream(self._stream.start_tls(ssl_context, server_hostname, remaining_s), self._backend)
+        stream = self._stream.start_tls(ssl_context, server_hostname, self._deadline.left(timeout))
+        return _DeadlineStream(stream, self._deadline)
 
     def get_extra_info(self, info: str) -> Any:
         return self._stream.get_extra_info(info)
+
+
+@functools.cache
+def _trusting(certificates: str | None) -> ssl.SSLContext:
+    return ssl.create_default_context(cafile=certificates)

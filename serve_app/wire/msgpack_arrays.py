@@ -57,9 +57,13 @@ def _pack_array(value: Any) -> dict[bytes, Any]:
 
 def _unpack_array(document: dict[Any, Any]) -> Any:
     if b"__ndarray__" in document:
-        return _array(document)
-    if b"nd" in document and b"type" in document:
-        return _array_of_msgpack_numpy(document)
+        return _array(document.get(b"data"), document.get(b"dtype"), document.get(b"shape"))
+    if b"nd" in document and b"type" in document:  # msgpack-numpy's, whose scalars have no shape
+        kind = document.get(b"kind", b"")
+        if kind not in (b"", ""):  # records, and pickled objects
+            raise ObservationError(f"a msgpack-numpy array in the message has kind {kind!r:.16}: send numbers")
+        shape = document.get(b"shape") if document[b"nd"] is True else []
+        return _array(document.get(b"data"), document[b"type"], shape)
     if b"__npgeneric__" in document:
         value = document.get(b"data")
         if not isinstance(value, bool | int | float):
@@ -82,37 +86,22 @@ def _counting_hooks(most: int) -> dict[str, Callable[[Any], Any]]:
     return {"list_hook": count, "object_hook": lambda document: _unpack_array(count(document))}
 
 
-def _are_sizes(shape: list[Any]) -> bool:
-    for size in shape:  # noqa: SIM110 - a generator is a call for each
-        if type(size) is not int or not 0 <= size < 2**31:
-            return False
-    return True
-
-
-def _array_of_msgpack_numpy(document: Mapping[Any, Any]) -> NDArray[Any]:
-    kind = document.get(b"kind", b"")
-    if kind not in (b"", ""):  # records, and pickled objects
-        raise ObservationError(f"a msgpack-numpy array in the message has kind {kind!r:.16}: send numbers")
-    shape = document.get(b"shape") if document[b"nd"] is True else []  # a scalar has none
-    return _array({b"data": document.get(b"data"), b"dtype": document[b"type"], b"shape": shape})
-
-
-def _array(document: Mapping[Any, Any]) -> NDArray[Any]:
-    data: Any = document.get(b"data")
-    name: Any = document.get(b"dtype")
-    shape: Any = document.get(b"shape")
-    dtype = (
-        DTYPES.get(name.decode("latin-1") if isinstance(name, bytes) else name) if type(name) in (str, bytes) else None
-    )
+def _array(data: Any, name: Any, shape: Any) -> NDArray[Any]:
+    text = name.decode("latin-1") if isinstance(name, bytes) else name
+    dtype = DTYPES.get(text) if type(text) is str else None
     if dtype is None:
         raise ObservationError(f"an array in the message has dtype {name!r:.32}: send numbers, such as '<f4'")
-    if type(shape) is not list or len(shape) > MAX_AXES or not _are_sizes(shape):
+    if (
+        type(shape) is not list
+        or len(shape) > MAX_AXES
+        or not all(type(size) is int and 0 <= size < 2**31 for size in shape)
+    ):
         raise ObservationError(f"an array in the message has the shape {shape!r:.64}: expected a list of sizes")
-    if type(data) is not bytes or len(data) != math.prod(shape) * dtype.itemsize:
+    needed = math.prod(shape) * dtype.itemsize
+    if type(data) is not bytes or len(data) != needed:
         got = f"{len(data)} bytes" if type(data) is bytes else f"a {type(data).__name__}"
         raise ObservationError(
-            f"an array in the message of shape {shape} and dtype {name} needs "
-            f"{math.prod(shape) * dtype.itemsize} bytes, got {got}"
+            f"an array in the message of shape {shape} and dtype {name} needs {needed} bytes, got {got}"
         )
     if dtype.kind == "b" and data.translate(None, b"\0\1"):  # in numpy any other byte is undefined
         raise ObservationError(f"an array in the message of dtype {name} holds a byte that is neither 0 nor 1")

@@ -6,6 +6,7 @@ do (KServe's and Triton's packages, robo-gym's). These classes have their own po
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -47,13 +48,13 @@ def build_messages(
     for service, methods in (services or {}).items():
         described = file.service.add(name=service)
         for method, types in methods.items():
-            given, made_of = types.replace("stream ", "stream_").split(" ")
+            given, made_of = re.findall(r"(stream )?(\S+)", types)
             described.method.add(
                 name=method,
-                input_type=f".{package}.{given.removeprefix('stream_')}",
-                output_type=f".{package}.{made_of.removeprefix('stream_')}",
-                client_streaming=given.startswith("stream_"),
-                server_streaming=made_of.startswith("stream_"),
+                input_type=f".{package}.{given[1]}",
+                output_type=f".{package}.{made_of[1]}",
+                client_streaming=bool(given[0]),
+                server_streaming=bool(made_of[0]),
             )
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())

@@ -76,7 +76,7 @@ def test_a_proxy_that_is_none_is_refused_without_its_password(monkeypatch: pytes
 
 def test_the_port_and_brackets_of_an_address_are_in_the_host_header(proxy: Server) -> None:
     with closing(Transport(f"http://127.0.0.1:{proxy.port}", timeout_s=10, retries=0)) as transport:
-        transport.post("v1", body=b"{}")
+        transport.post("v1", document={})
     assert f"\r\nhost: 127.0.0.1:{proxy.port}\r\n".encode() in proxy.asked[0].lower()
     assert b"\r\ncontent-length: 2\r\n" in proxy.asked[0].lower()
 

@@ -285,16 +285,6 @@ def test_what_a_policy_sees_of_its_actions_is_what_it_gave(start: Callable[..., 
     assert (report.compared, report.identical, report.changed) == (6, 6, 0)
 
 
-def test_a_session_keeps_no_request_alive(start: Callable[..., Server]) -> None:
-    server = start()
-    body = {"obs": [0.5, 0.25, 0.125], "session_id": "a", "reset": True}
-    for seq in ({}, {"seq": 1}):
-        assert server.act("lstm_box", body | seq)[0] == 200
-        session = server.handler.episodes.sessions.find("lstm_box", "a")
-        assert session is not None and (session.answer is None or session.answer.inputs == {})
-    assert session.answer is not None
-
-
 def test_records_keep_no_large_request_alive(start: Callable[..., Server], monkeypatch: pytest.MonkeyPatch) -> None:
     server, kept = start(), []
     monkeypatch.setattr(server.recorder.recorder, "record", kept.append)
