@@ -8,11 +8,10 @@ from typing import Any
 
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import RequestError, UsageError
-from rlservo.serve_app.repository.repository import raise_all
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import plan_files, version_loader
 from rlservo.serve_app.versions.plan_commands import Changed, parse
-from rlservo.serve_app.versions.plan_writer import PlanWriter
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan
 
 
@@ -31,7 +30,7 @@ class OfflineCommands:
             given = parse(command, document)
         except RequestError as error:
             raise UsageError(error.message) from None
-        plan = asyncio.run(PlanWriter(self._loader, self._files).give(given, name))
+        plan = asyncio.run(PlanFollower(self._loader, self._files).write(given, name))
         return {**Changed.of(plan, name).model_dump(), "place": self._files.place}
 
     def listing(self) -> dict[str, Any]:
@@ -44,9 +43,9 @@ class OfflineCommands:
     async def _listing(self) -> dict[str, Any]:
         plan = await self._files.call(self._files.newest)
         listing = await self._loader.look()
-        digests, errors = listing.digests, listing.wrong
+        digests, errors = listing.digests, listing.errors.values()
         if plan is None and not digests:
-            raise_all(errors)
+            listing.available(needs_all=True)
         policies = {} if plan is None else plan.policies
         others: dict[str, list[str]] = {name: [] for name, policy in policies.items() if policy.versions}
         for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
@@ -63,5 +62,5 @@ class OfflineCommands:
 
 
 def _described(plan: Plan | None, name: str) -> dict[str, Any]:
-    changed = Changed.of(plan or Plan(generation=0, policies={}, changed_at="", changed_by=""), name)
+    changed = Changed.of(plan or Plan(generation=0, policies={}), name)
     return {"name": name, **changed.model_dump(exclude={"generation", "policy"})}
