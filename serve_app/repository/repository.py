@@ -65,9 +65,12 @@ class Listing:
             )
 
     @property
-    def digests(self) -> dict[Key, str]:
-        """The hash of every bundle that can be served."""
-        return {key: digest for key, (digest, _) in self.found.items() if key not in self.errors}
+    def digests(self) -> dict[str, dict[str, str]]:
+        """The hash of every bundle that can be served, by name and version, oldest first."""
+        digests: dict[str, dict[str, str]] = {}
+        for key in sorted(self.found.keys() - self.errors.keys(), key=lambda key: version_key(key[1])):
+            digests.setdefault(key[0], {})[key[1]] = self.found[key][0]
+        return digests
 
     def check_read(self) -> None:
         """Raise UnavailableError if a storage did not answer."""
@@ -76,18 +79,14 @@ class Listing:
                 raise error
 
     def available(self, *, needs_all: bool) -> dict[str, dict[str, str]]:
-        """Return every bundle's hash by name and version, for a first plan.
+        """Return `digests` for a first plan; with `needs_all` no bundle may be broken.
 
-        With `needs_all` no bundle may be broken. Raises BundleError or UsageError, and UnavailableError if a storage
-        does not answer.
+        Raises BundleError or UsageError, and UnavailableError if a storage does not answer.
         """
         self.check_read()
         if needs_all:
             raise_all(self.errors)
-        hashes: dict[str, dict[str, str]] = {}
-        for (name, version), digest in sorted(self.digests.items(), key=lambda each: version_key(each[0][1])):
-            hashes.setdefault(name, {})[version] = digest
-        return hashes
+        return self.digests
 
     def find(self, name: str, version: str | None) -> tuple[str, str]:
         """Return (version, hash) of a bundle; None is the newest one.
@@ -95,13 +94,12 @@ class Listing:
         Raises UnknownPolicyError or UnknownVersionError, the bundle's own error if it cannot be served, and
         UnavailableError if a storage that does not answer may have it.
         """
-        digests = {v: digest for (n, v), digest in self.digests.items() if n == name}
-        versions = sorted(digests, key=version_key)
-        if version is None or version not in digests:
+        versions = self.digests.get(name, {})
+        if version is None or version not in versions:
             self.check_read()
-        wanted = version or max(versions, key=version_key, default="")
-        if wanted in digests:
-            return wanted, digests[wanted]
+        wanted = version or next(reversed(versions), "")
+        if wanted in versions:
+            return wanted, versions[wanted]
         # The error of a broken bundle helps more than the statement that there is none.
         for key, error in self.errors.items():
             if key[0] == name and version in (key[1], None):

@@ -6,7 +6,6 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
-from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import RequestError, UsageError
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import plan_files, version_loader
@@ -48,9 +47,9 @@ class OfflineCommands:
             listing.available(needs_all=True)
         policies = {} if plan is None else plan.policies
         others: dict[str, list[str]] = {name: [] for name, policy in policies.items() if policy.versions}
-        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
-            if name not in policies or version not in policies[name].versions:
-                others.setdefault(name, []).append(version)
+        for name, versions in digests.items():
+            loaded = policies[name].versions if name in policies else {}
+            others[name] = [version for version in versions if version not in loaded]
         return {
             "place": self._files.place,
             "generation": 0 if plan is None else plan.generation,

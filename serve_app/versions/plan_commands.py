@@ -79,14 +79,7 @@ class Load(Command):
         return {**plan.policies, name: self.changed(name, plan.policies.get(name) or PolicyPlan())}
 
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
-        version = str(self.version)
-        uses = _uses(policy, version)
-        if uses and policy.versions[version] != self._digest:
-            raise ConflictError(
-                f"policy '{name}' version {version} is in use by {uses}, but its folder now holds another bundle: "
-                "export changes under a new version, or point that elsewhere first"
-            )
-        return _changed(name, policy, versions={**policy.versions, version: self._digest})
+        return _changed(name, policy, versions={**policy.versions, str(self.version): self._digest})
 
 
 class Poll(Load):
@@ -107,8 +100,6 @@ class Unload(Command):
         _require(name, policy, version)
         if len(policy.versions) == 1:
             raise ConflictError(f"version {version} is the last of policy '{name}': unload the policy itself")
-        if uses := _uses(policy, version):
-            raise ConflictError(f"policy '{name}' version {version} is in use by {uses}: point that elsewhere first")
         return _changed(name, policy, versions={v: each for v, each in policy.versions.items() if v != version})
 
 
@@ -135,7 +126,6 @@ class SetAlias(Command):
                 "someone moved it"
             )
         if self.version is not None:
-            _require(name, policy, self.version)
             return _changed(name, policy, aliases={**policy.aliases, alias: self.version})
         if alias not in policy.aliases:
             raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(policy.aliases)}")
@@ -144,9 +134,6 @@ class SetAlias(Command):
                 f"the alias '{PRODUCTION}' of policy '{name}' names the version for clients that name none: point it "
                 "elsewhere, or unload the policy"
             )
-        for use, reference in policy.uses.items():
-            if reference == alias:
-                raise ConflictError(f"the alias '{alias}' of policy '{name}' is in use by {use}: end that first")
         return _changed(name, policy, aliases={a: v for a, v in policy.aliases.items() if a != alias})
 
 
@@ -234,11 +221,10 @@ def first_policies(config: ServedConfig, listing: Listing) -> Policies:
     unlisted = available if config.unlisted == "load" else ()
     policies = {}
     for name, wanted in sorted(({name: PolicyConfig() for name in unlisted} | config.policies).items()):
-        if wanted.versions is None:
-            listing.find(name, None)  # raises if there is none
-            versions = available[name]
-        else:
+        if wanted.versions is not None:
             versions = dict(listing.find(name, version) for version in wanted.versions)
+        elif not (versions := available.get(name, {})):
+            listing.find(name, None)  # which raises
         policies[name] = _changed(
             name, PolicyPlan(), versions=versions,
             aliases=wanted.aliases, canary=wanted.canary, shadow=wanted.shadow,
@@ -274,7 +260,7 @@ def differences(before: Mapping[str, PolicyPlan], after: Mapping[str, PolicyPlan
 
 
 def _changed(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
-    """Return a policy with these changes: versions sorted, no use without a loaded version, the way back kept."""
+    """Return a policy with these changes: versions sorted, each use with its loaded bundle, the way back kept."""
     versions = _sorted(changes.get("versions", was.versions))
     if len({version_key(version) for version in versions}) != len(versions):
         raise ConflictError(f"policy '{name}': two versions compare equal, as '1' and '1.0.0' do: keep one of them")
@@ -284,8 +270,18 @@ def _changed(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
     unloaded = {v: digest for v, digest in _sorted({**was.unloaded, **was.versions}).items() if v not in versions}
     changes |= {"versions": versions, "aliases": aliases, "history": _moved(was, aliases), "unloaded": unloaded}
     policy = was.model_copy(update=changes)
-    for reference in policy.uses.values():
-        _require(name, policy, reference)
+    lost: dict[str, list[str]] = {}  # uses by the version that they had
+    for use, reference in policy.uses.items():
+        had = was.version_of(reference)
+        if had is None:
+            _require(name, policy, reference)
+        elif policy.version_of(reference) is None or versions[had] != was.versions[had]:
+            lost.setdefault(had, []).append(use)
+    for version, uses in lost.items():
+        raise ConflictError(
+            f"policy '{name}' version {version} is in use by {' and '.join(uses)}: end that or point it elsewhere "
+            "first, and export changes of a bundle under a new version"
+        )
     return policy
 
 
@@ -299,11 +295,6 @@ def _moved(policy: PolicyPlan, aliases: Mapping[str, str]) -> dict[str, tuple[st
         if history.get(alias, ())[-1:] == (version,):
             history[alias] = history[alias][:-1]
     return history
-
-
-def _uses(policy: PolicyPlan, version: str) -> str:
-    """Return everything that points to a version, in words."""
-    return " and ".join(use for use, reference in policy.uses.items() if policy.version_of(reference) == version)
 
 
 def _require(name: str, policy: PolicyPlan, reference: str) -> None:

@@ -201,7 +201,7 @@ class PlanFollower:
         listing = await self._loader.look()
         digests, wrong = listing.digests, {error.message for error in listing.errors.values()}
         for name, version in self._newer(digests):
-            key = (name, version, digests[name, version])
+            key = (name, version, digests[name][version])
             if time.monotonic() < self._refused_until.get(key, 0.0):
                 continue
             try:
@@ -212,19 +212,17 @@ class PlanFollower:
                     self._refused_until[key] = time.monotonic() + REFUSED_PERIOD_S
         return wrong
 
-    def _newer(self, digests: Mapping[Key, str]) -> list[Key]:
+    def _newer(self, digests: Mapping[str, Mapping[str, str]]) -> list[Key]:
         """Return the versions that a policy's known ones are all older than; of an unknown policy only the newest."""
         policies = {} if self.plan is None else self.plan.policies
         newer: list[Key] = []
-        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
+        for name, versions in sorted(digests.items()):
             listed, known = self._config.policies.get(name), policies.get(name)
             if self._config.unlisted == "ignore" if listed is None else listed.versions is not None:
                 continue
-            if known is None and newer and newer[-1][0] == name:
-                newer.pop()
-            before = () if known is None else (*known.versions, *known.unloaded)
-            if all(version_key(version) > version_key(each) for each in before):
-                newer.append((name, version))
+            before = [] if known is None else [version_key(each) for each in (*known.versions, *known.unloaded)]
+            later = [(name, version) for version in versions if all(version_key(version) > each for each in before)]
+            newer += later if known is not None else later[-1:]
         return newer
 
     def states(self) -> dict[str, dict[str, VersionState]]:

@@ -142,7 +142,7 @@ def test_production_is_moved_but_neither_removed_nor_unloaded_nor_exchanged() ->
         alias(now, "ur5", "production", None)
     with pytest.raises(ConflictError, match="version 10 is in use by the alias 'production'"):
         unload(now, "ur5", "10")
-    with pytest.raises(ConflictError, match="by the alias 'production', but its folder now holds another bundle"):
+    with pytest.raises(ConflictError, match=r"version 10 is in use by the alias 'production': .* under a new version"):
         load(now, "ur5", "10", "exchanged")
     assert load(now, "ur5", "10", "c")["ur5"] == now.policies["ur5"]
     assert load(now, "ur5", "2", "exchanged")["ur5"].versions["2"] == "exchanged"  # nothing leads there
@@ -177,7 +177,7 @@ def test_what_is_in_use_is_not_unloaded() -> None:
         unload(now, "ur5", "2")
     with pytest.raises(ConflictError, match="in use by the shadow"):
         unload(now, "ur5", "10")
-    with pytest.raises(ConflictError, match="in use by the canary: end that first"):
+    with pytest.raises(ConflictError, match="in use by the canary: end that"):
         alias(now, "ur5", "candidate", None)
     with pytest.raises(ConflictError, match="the last of policy 'mir'"):
         unload(now, "mir", "1")
