@@ -246,17 +246,16 @@ def agrees(plan: Plan, config: ServedConfig) -> bool:
     return config.unlisted == "load" or served <= config.policies.keys()
 
 
-def differences(before: Mapping[str, PolicyPlan], after: Mapping[str, PolicyPlan]) -> dict[tuple[str, str, str], Any]:
-    """Return what is served differently after than before, by policy, field and version or alias."""
-    changed: dict[tuple[str, str, str], Any] = {}
-    for name in before.keys() | after.keys():
-        was, now = (policies.get(name) or PolicyPlan() for policies in (before, after))
-        for field, old, new in (("versions", was.versions, now.versions), ("aliases", was.aliases, now.aliases)):
-            changed |= {(name, field, key): new.get(key) for key in old | new if old.get(key) != new.get(key)}
-        for field in ("canary", "shadow"):
-            if getattr(was, field) != getattr(now, field):
-                changed[name, field, ""] = getattr(now, field)
-    return changed
+def differences(before: Policies, after: Policies, name: str) -> dict[str, Any]:
+    """Return what is served differently of a policy after than before, by version, alias and use."""
+
+    def served(policies: Policies) -> dict[str, Any]:
+        policy = policies.get(name, PolicyPlan())
+        versions = {f"version {version}": digest for version, digest in policy.versions.items()}
+        return {**versions, **policy.uses, "the canary": policy.canary}
+
+    was, now = served(before), served(after)
+    return {key: now.get(key) for key in was.keys() | now.keys() if was.get(key) != now.get(key)}
 
 
 def _changed(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:

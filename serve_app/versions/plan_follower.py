@@ -146,7 +146,7 @@ class PlanFollower:
             first = await self._files.call(self._files.newest)
             if first is None:
                 raise UnavailableError(f"{self._files.place} has lost the plan that was just there")
-            ours, theirs = differences(before.policies, policies), differences(before.policies, first.policies)
+            ours, theirs = (differences(before.policies, each, name) for each in (policies, first.policies))
             if ours.items() <= theirs.items():
                 return first  # another operator has given the same command
             if any(key in theirs and theirs[key] != value for key, value in ours.items()):
