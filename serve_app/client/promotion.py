@@ -89,7 +89,7 @@ class Promotion:
             self._ours[SHADOW] = terms.version
         self._last_change = ""  # of the server's plan, in words
         self._decided_at: int | None = None  # the plan at an earlier run's decision
-        self._ends_at, self._logged_at = clock() + terms.seconds, -math.inf
+        self._ends_at = clock() + terms.seconds
 
     def run(self) -> Outcome:
         """Watch and decide. Raises RlservoError if it cannot begin: bad input, or an unreachable server."""
@@ -193,15 +193,16 @@ class Promotion:
         self._say(f"continuing: {max(0.0, self._remaining):.0f} s are left")
         return True
 
-    def _write(self, event: str, decided: Outcome | None = None, found: list[str] | None = None) -> None:
+    def _write(self, event: str, decided: Outcome | None = None, **fields: Any) -> None:
         """Log everything that a promotion continues from. Raises UsageError."""
         self._state.decided, self._state.remaining_s = decided, self._remaining
-        self._log.write(event, asdict(self._state) | {"figures": found})
+        self._log.write(event, fields | asdict(self._state))
 
     # Watch.
 
     def _watch(self) -> Outcome:
         """Return the outcome. Raises UsageError if the log cannot be written, ConflictError as `_check` does."""
+        terms, logged_at = self._terms, -math.inf
         while True:
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
             try:
@@ -212,8 +213,16 @@ class Promotion:
                 return Outcome(ROLLED_BACK, error.message)
             except RlservoError as error:
                 return Outcome(ROLLED_BACK, f"it could not be judged for {PATIENCE_S:g} s: {error.message}")
-            if outcome := self._judge():
-                return outcome
+            remaining, counted = self._remaining, self._state.counts.total
+            found = list(figures(terms.limits, counted, self._state.production, terms.version))
+            surely, shown = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
+            if surely or remaining <= 0 or self._clock() - logged_at >= terms.seconds / MOST_CHECKS:
+                logged_at = self._clock()
+                self._write("check", figures=[str(each) for each in found])
+            self._say(f"{max(0.0, remaining):.0f} s left; {shown}")
+            if surely or remaining <= 0:
+                against = surely or [each for each in found if each.is_beyond or each.lacks]
+                return Outcome(ROLLED_BACK, "; ".join(map(str, against))) if against else Outcome(PROMOTED, shown)
 
     def _look(self) -> None:
         """Update the counts. Raises ConflictError if another command has changed what is served, UntrustedError."""
@@ -227,20 +236,6 @@ class Promotion:
                 )
             if self._terms.version not in process.versions:
                 raise UnavailableError(f"replica '{name}' has not loaded version {self._terms.version}")
-
-    def _judge(self) -> Outcome | None:
-        """Log the counts; return the outcome if there is one."""
-        terms, remaining = self._terms, self._remaining
-        found = list(figures(terms.limits, self._state.counts.total, self._state.production, terms.version))
-        surely, all_of_it = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
-        if surely or remaining <= 0 or self._clock() - self._logged_at >= terms.seconds / MOST_CHECKS:
-            self._logged_at = self._clock()
-            self._write("check", found=[str(each) for each in found])
-        self._say(f"{max(0.0, remaining):.0f} s left; {all_of_it}")
-        if remaining > 0 and not surely:
-            return None
-        against = surely or [each for each in found if each.is_beyond or each.lacks]
-        return Outcome(ROLLED_BACK, "; ".join(map(str, against))) if against else Outcome(PROMOTED, all_of_it)
 
     def _check(self, uses: dict[str, str]) -> None:
         """Raise ConflictError if another command has changed what is served."""

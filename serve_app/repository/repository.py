@@ -259,11 +259,10 @@ def raise_all(errors: Mapping[Key, RlservoError]) -> None:
     """Raise the error of a version, or one that lists all of them; its details have each version's reason."""
     if not errors:
         return
-    sentences = [error.message for error in errors.values()]
-    details = [{"name": n, "version": v, "reason": error.message} for (n, v), error in errors.items()]
     error = next(iter(errors.values()))
     if len(errors) > 1:
         kind = UnavailableError if all(isinstance(each, UnavailableError) for each in errors.values()) else BundleError
-        error = kind(f"{len(errors)} bundles cannot be served: {'; '.join(sentences)}")
-    error.details["versions"] = details
+        sentences = "; ".join(each.message for each in errors.values())
+        error = kind(f"{len(errors)} bundles cannot be served: {sentences}")
+    error.details["versions"] = [{"name": n, "version": v, "reason": e.message} for (n, v), e in errors.items()]
     raise error

@@ -45,7 +45,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
                 "aliases": arranged.aliases,
                 "previous": {alias: earlier[-1] for alias, earlier in arranged.history.items() if earlier},
                 "canary": arranged.canary and arranged.canary.model_dump(),
-                "shadow": shadow and {"version": shadow.version},
+                "shadow": shadow and {"version": shadow.contract.version},
                 "version_states": versions,
             }
         )

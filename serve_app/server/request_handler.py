@@ -190,7 +190,7 @@ class RequestHandler:
             self._check_batch(store, request)
         decision = await self.episodes.act(store, request)
         shadow = store.shadow(name)
-        if shadow is not None and decision.version == shadow.of and not request.explore:
+        if shadow is not None and decision.version == store.default(name) and not request.explore:
             self.shadows.offer(shadow, obs, decision)
         return decision
 

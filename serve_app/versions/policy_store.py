@@ -58,15 +58,6 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True)
-class Shadow:
-    """A version whose actions are computed and compared with the default version's, and not used."""
-
-    of: str  # the default version
-    version: str
-    policy: Policy
-
-
-@dataclass(frozen=True, slots=True)
 class _Served:
     """One policy's loaded versions, and their uses."""
 
@@ -75,7 +66,7 @@ class _Served:
     default: Policy
     canary: Policy | None
     canary_share: float
-    shadow: Shadow | None
+    shadow: Policy | None
 
 
 class PolicyStore:
@@ -171,8 +162,8 @@ class PolicyStore:
         served = self._served.get(name)
         return label is None and served is not None and served.canary is not None
 
-    def shadow(self, name: str) -> Shadow | None:
-        """Return the policy's shadow, if it has one."""
+    def shadow(self, name: str) -> Policy | None:
+        """Return the policy whose actions are compared with the default's, and not used, if there is one."""
         return self._find(name).shadow
 
     def close(self) -> None:
@@ -198,11 +189,8 @@ def _serve(name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> _Serv
     canary, share = None, 0.0
     if plan.canary is not None:
         canary, share = versions.get(plan.version_of(plan.canary.version) or ""), plan.canary.share
-    shadow: Shadow | None = None
-    if plan.shadow is not None:
-        policy = versions.get(plan.version_of(plan.shadow) or "")
-        if policy is not None and policy is not default:
-            shadow = Shadow(default.contract.version, policy.contract.version, policy.clone())
+    shadow = versions.get(plan.version_of(plan.shadow or "") or "")
+    shadow = None if shadow is None or shadow is default else shadow.clone()
     return _Served(plan, versions, default, canary, share, shadow)
 
 

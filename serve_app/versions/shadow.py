@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.versions.policy_store import Decision, Shadow
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions.policy_store import Decision
 
 logger = logging.getLogger(__name__)
 
@@ -33,19 +34,19 @@ class Shadows:
 
     def __init__(self, record: Record) -> None:
         self._record = record
-        self._waiting: queue.Queue[tuple[Shadow, Any, Decision]] = queue.Queue(WAITING)
+        self._waiting: queue.Queue[tuple[Policy, Any, Decision]] = queue.Queue(WAITING)
         self._thread: threading.Thread | None = None
         self.missed: Counter[tuple[tuple[str, str, str], str]] = Counter()
         """Actions that were not compared, by ((policy, version, shadow), reason)."""
 
-    def offer(self, shadow: Shadow, obs: Any, decision: Decision) -> None:
+    def offer(self, shadow: Policy, obs: Any, decision: Decision) -> None:
         """Queue `obs` for the candidate. Never waits.
 
         A stateful candidate is skipped: it would need a recurrent state of its own for every caller.
         """
-        series = (decision.name, decision.version, shadow.version)
+        series = (decision.name, decision.version, shadow.contract.version)
         self.missed.setdefault((series, "failed"), 0)  # counted in the other thread
-        if shadow.policy.is_stateful:
+        if shadow.is_stateful:
             self.missed[series, "left-out"] += 1
             return
         if self._thread is None:
@@ -59,12 +60,12 @@ class Shadows:
     def _run(self) -> None:
         while True:
             shadow, obs, decision = self._waiting.get()
-            series = (decision.name, decision.version, shadow.version)
+            series = (decision.name, decision.version, shadow.contract.version)
             try:
-                differences = _differences(shadow.policy.act(obs), decision.action, batch=decision.batch)
+                differences = _differences(shadow.act(obs), decision.action, batch=decision.batch)
             except Exception as error:  # this thread serves every shadow and must survive a broken one
                 if not isinstance(error, RlservoError):  # as if its action left the space: a shadow is run to find that
-                    logger.exception("shadow %s of policy '%s' failed", shadow.version, decision.name)
+                    logger.exception("shadow %s of policy '%s' failed", shadow.contract.version, decision.name)
                 self.missed[series, "failed"] += 1
             else:
                 self._record(*series, differences.tolist())
