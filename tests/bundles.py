@@ -431,7 +431,7 @@ def controlled() -> Callable[..., AbstractContextManager[PlanFollower]]:
     def control_of(*folders: Path, config: Any = None, **loader: Any) -> Iterator[PlanFollower]:
         loads = VersionLoader(Repository(list(folders)), **loader)
         with tempfile.TemporaryDirectory() as plans:
-            control = PlanFollower(loads, plan_files(Path(plans)), replica="only")
+            control = PlanFollower(loads, plan_files(Path(plans)))
             asyncio.run(control.configure({} if config is None else config))
             yield control
 

@@ -11,14 +11,16 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, NamedTuple, TypeVar
+
+from pydantic import TypeAdapter
 
 from rlservo.export.contract.errors import ConflictError, RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.promotion_evidence import Counts, Limits, Process, UntrustedError, figures, read_metrics
-from rlservo.serve_app.client.promotion_log import END, PromotionLog
+from rlservo.serve_app.client.promotion_log import PromotionLog
 from rlservo.serve_app.interface import PRODUCTION
 
 PATIENCE_S = 60.0  # with a server that is unreachable, or a process that does not follow
@@ -52,12 +54,16 @@ class Outcome(NamedTuple):
     """Whether the server's plan matches the outcome; if not, the same promotion started again continues."""
 
 
-class _Served(NamedTuple):
-    """The server's plan of the policy."""
+@dataclass
+class State:
+    """What a promotion continues from, in each line of its log."""
 
-    last_change: str
-    versions: list[str]
-    uses: dict[str, str]  # of production, the canary (such as "2=0.1") and the shadow; "none" without one
+    terms: Terms
+    production: str = ""  # version at the start
+    generation: int = 0  # of the newest plan that was seen
+    remaining_s: float = 0.0
+    decided: Outcome | None = None
+    counts: Counts = field(default_factory=Counts)
 
 
 class Promotion:
@@ -77,25 +83,23 @@ class Promotion:
         """`connect` makes a client for an address, with the key as it is then; `say` takes lines for the operator."""
         self._connect, self._terms, self._log = connect, terms, log
         self._every_s, self._say, self._sleep, self._clock = every_s, say, sleep, clock
-        self._ours = {IN_USE: "", CANARY: f"{terms.version}={terms.share:g}"}  # uses of versions meanwhile
+        self._state = State(terms)
+        self._ours = {CANARY: f"{terms.version}={terms.share:g}"}  # uses of versions meanwhile
         if terms.limits.action_difference is not None:
             self._ours[SHADOW] = terms.version
-        self._generation = 0  # of the newest plan that was seen
-        self._decided_at: int | None = None  # that of an earlier run's decision
-        self._counts = Counts()
+        self._last_change = ""  # of the server's plan, in words
+        self._decided_at: int | None = None  # the plan at an earlier run's decision
         self._ends_at = clock() + terms.seconds
-        self._logged_at = -math.inf
 
     def run(self) -> Outcome:
         """Watch and decide. Raises RlservoError if it cannot begin: bad input, or an unreachable server."""
-        last, decided = self._log.last, None
-        if last is None:
+        is_new = not self._resume()
+        if is_new:
             self._begin()
-        else:
-            decided = self._resume(last)
+        decided = self._state.decided
         try:
             if decided is None:
-                if last is None:
+                if is_new:
                     self._start()
                 decided = self._watch()
                 self._write("decision", decided)
@@ -114,7 +118,7 @@ class Promotion:
                 is_finished=False,
             )
         try:
-            self._write(END, outcome)
+            self._write("end", outcome)
         except UsageError as error:
             self._say(error.message)  # the same command, repeated, finds nothing left to do
         return outcome
@@ -135,25 +139,23 @@ class Promotion:
 
     def _begin(self) -> None:
         """Check the server's plan, and count from here on. Raises RlservoError."""
-        terms, served = self._terms, self._served()
-        name, version = terms.policy, terms.version
-        if not served.versions:
-            raise UsageError(f"no policy '{name}' is served: see 'rlservo policy list'")
-        if version not in served.versions:
+        name, version, (versions, uses) = self._terms.policy, self._terms.version, self._served()
+        if version not in versions:
             raise UsageError(
-                f"policy '{name}' has no version {version}: expected one of {', '.join(served.versions)}; "
+                f"policy '{name}' has no version {version}: expected one of {', '.join(versions) or 'none'}; "
                 f"'rlservo policy load {name} {version}' loads it"
             )
-        if served.uses[IN_USE] == version:
+        if uses[IN_USE] == version:
             raise UsageError(f"version {version} of policy '{name}' is in production already")
-        for use, kind in ((CANARY, "canary"), (SHADOW, "shadow")):
-            if use in self._ours and (running := served.uses[use]) != "none":
+        for use in self._ours:
+            if uses[use] != "none":
+                kind = use.removeprefix("the ")
                 raise UsageError(
-                    f"policy '{name}' has a {kind} already, {running}: 'rlservo policy {kind} {name} off' ends it "
-                    f"({served.last_change})"
+                    f"policy '{name}' has a {kind} already, {uses[use]}: 'rlservo policy {kind} {name} off' ends it "
+                    f"({self._last_change})"
                 )
-        self._ours[IN_USE] = served.uses[IN_USE]
-        self._counts.add(self._processes())
+        self._state.production = uses[IN_USE]
+        self._state.counts.add(self._processes())
         self._write("start")
 
     def _start(self) -> None:
@@ -164,93 +166,86 @@ class Promotion:
         self._change(lambda client: client.canary(terms.policy, terms.version, terms.share))
         self._ends_at = self._clock() + terms.seconds
         self._say(
-            f"watching version {terms.version} of '{terms.policy}' against {self._ours[IN_USE]} for "
-            f"{terms.seconds:.0f} s on {', '.join(self._counts.seen)}; the log is {self._log.path}"
+            f"watching version {terms.version} of '{terms.policy}' against {self._state.production} for "
+            f"{terms.seconds:.0f} s on {', '.join(self._state.counts.seen)}; the log is {self._log.path}"
         )
 
-    def _resume(self, last: dict[str, Any]) -> Outcome | None:
-        """Restore the state from the log; return its decision, if it has one."""
-        if last["terms"] != json.loads(json.dumps(asdict(self._terms))):
+    def _resume(self) -> bool:
+        """Restore the state from the log; return False if it has no promotion that has not ended. Raises UsageError."""
+        if not self._log.last:
+            return False
+        try:
+            line = json.loads(self._log.last)
+            gone_s = time.time() - datetime.fromisoformat(line.pop("time")).timestamp()
+            if line.pop("event") == "end":
+                return False
+            state = TypeAdapter(State).validate_python(line)
+        except (ValueError, KeyError) as error:  # ValidationError is one
+            raise UsageError(f"{self._log.path} cannot be read ({error}): name another --log") from None
+        if state.terms != self._terms:
             raise UsageError(
-                f"{self._log.path} has an unfinished promotion with other terms ({last['terms']}): give that command "
+                f"{self._log.path} has an unfinished promotion with other terms ({state.terms}): give that command "
                 "again, or name another --log"
             )
-        try:
-            self._ours[IN_USE], self._generation = last["production"], int(last["generation"])
-            self._counts = Counts(**last["counts"])
-            # A clock that was set back adds no time.
-            gone_s = max(0.0, time.time() - datetime.fromisoformat(last["time"]).timestamp())
-            self._ends_at = self._clock() + last["remaining_s"] - gone_s
-            decided = Outcome(*last["decided"]) if last["decided"] else None
-        except (KeyError, TypeError, ValueError) as error:
-            raise UsageError(f"{self._log.path} cannot be read ({error!r}): name another --log") from None
-        self._decided_at = self._generation if decided else None
+        # A clock that was set back adds no time.
+        self._state, self._ends_at = state, self._clock() + state.remaining_s - max(0.0, gone_s)
+        self._decided_at = state.generation if state.decided else None
         self._say(f"continuing: {max(0.0, self._remaining):.0f} s are left")
-        return decided
+        return True
 
     def _write(self, event: str, decided: Outcome | None = None, **fields: Any) -> None:
         """Log everything that a promotion continues from. Raises UsageError."""
-        state = {
-            "terms": asdict(self._terms),
-            "production": self._ours[IN_USE],
-            "generation": self._generation,
-            "counts": asdict(self._counts),
-            "remaining_s": self._remaining,
-            "decided": decided,
-        }
-        self._log.write(event, fields | state)
+        self._state.decided, self._state.remaining_s = decided, self._remaining
+        self._log.write(event, fields | asdict(self._state))
 
     # Watch.
 
     def _watch(self) -> Outcome:
-        """Return the outcome, when there is one. Raises UsageError if the log cannot be written."""
+        """Return the outcome. Raises UsageError if the log cannot be written, ConflictError as `_check` does."""
+        terms, logged_at = self._terms, -math.inf
         while True:
             self._sleep(min(self._every_s, max(self._remaining, min(1.0, self._every_s))))
             try:
                 self._patiently(self._look)
-            except ConflictError as error:
-                return Outcome(STOPPED, error.message)
+            except ConflictError:
+                raise
             except UntrustedError as error:
                 return Outcome(ROLLED_BACK, error.message)
             except RlservoError as error:
                 return Outcome(ROLLED_BACK, f"it could not be judged for {PATIENCE_S:g} s: {error.message}")
-            if outcome := self._judge():
-                return outcome
+            remaining, counted = self._remaining, self._state.counts.total
+            found = list(figures(terms.limits, counted, self._state.production, terms.version))
+            surely, shown = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
+            if surely or remaining <= 0 or self._clock() - logged_at >= terms.seconds / MOST_CHECKS:
+                logged_at = self._clock()
+                self._write("check", figures=[str(each) for each in found])
+            self._say(f"{max(0.0, remaining):.0f} s left; {shown}")
+            if surely or remaining <= 0:
+                against = surely or [each for each in found if each.is_beyond or each.lacks]
+                return Outcome(ROLLED_BACK, "; ".join(map(str, against))) if against else Outcome(PROMOTED, shown)
 
     def _look(self) -> None:
         """Update the counts. Raises ConflictError if another command has changed what is served, UntrustedError."""
-        self._check(self._served())
+        self._check(self._served()[1])
         processes = self._processes()
-        self._counts.add(processes)
+        self._state.counts.add(processes)
         for name, process in processes.items():
-            if process.plan < self._generation:
-                raise UnavailableError(f"replica '{name}' follows plan {process.plan:g}, not yet {self._generation}")
+            if process.plan < self._state.generation:
+                raise UnavailableError(
+                    f"replica '{name}' follows plan {process.plan:g}, not yet {self._state.generation}"
+                )
             if self._terms.version not in process.versions:
                 raise UnavailableError(f"replica '{name}' has not loaded version {self._terms.version}")
 
-    def _judge(self) -> Outcome | None:
-        """Log the counts; return the outcome if there is one."""
-        terms, remaining = self._terms, self._remaining
-        found = list(figures(terms.limits, self._counts.total, self._ours[IN_USE], terms.version))
-        surely, all_of_it = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
-        if surely or remaining <= 0 or self._clock() - self._logged_at >= terms.seconds / MOST_CHECKS:
-            self._logged_at = self._clock()
-            self._write("check", figures=list(map(str, found)))
-        self._say(f"{max(0.0, remaining):.0f} s left; {all_of_it}")
-        if remaining > 0 and not surely:
-            return None
-        against = surely or [each for each in found if each.is_beyond or each.lacks]
-        return Outcome(ROLLED_BACK, "; ".join(map(str, against))) if against else Outcome(PROMOTED, all_of_it)
-
-    def _check(self, served: _Served) -> None:
+    def _check(self, uses: dict[str, str]) -> None:
         """Raise ConflictError if another command has changed what is served."""
-        if not served.versions:
+        if uses[IN_USE] == "none":
             raise ConflictError(f"policy '{self._terms.policy}' is no longer served")
-        for use, ours in self._ours.items():
-            if (now := served.uses[use]) != ours:  # a version that is unloaded has none
+        for use, ours in {IN_USE: self._state.production, **self._ours}.items():
+            if uses[use] != ours:  # a version that is unloaded has none
                 raise ConflictError(
-                    f"another command has changed what is served: {use} is {now} and no longer {ours} "
-                    f"({served.last_change})"
+                    f"another command has changed what is served: {use} is {uses[use]} and no longer {ours} "
+                    f"({self._last_change})"
                 )
 
     # Carry out what was decided.
@@ -260,52 +255,47 @@ class Promotion:
 
         Steps that are finished are not repeated. Raises RlservoError.
         """
-        name, version, served = self._terms.policy, self._terms.version, self._served()
+        name, version, (_, uses) = self._terms.policy, self._terms.version, self._served()
         outcome, why, _ = decided
-        if outcome == PROMOTED and served.uses[IN_USE] != version:
+        if outcome == PROMOTED and uses[IN_USE] != version:
             try:
-                self._check(served)
-                if self._decided_at not in (None, self._generation):
-                    raise ConflictError(
-                        f"someone may have undone this promotion ({served.last_change}): start it again"
-                    )
-                self._change(lambda client: client.alias(name, PRODUCTION, version, expected=self._ours[IN_USE]))
+                self._check(uses)
+                if self._decided_at not in (None, self._state.generation):
+                    raise ConflictError(f"someone may have undone this promotion ({self._last_change}): start it again")
+                self._change(lambda client: client.alias(name, PRODUCTION, version, expected=self._state.production))
             except ConflictError as error:
                 outcome, why = STOPPED, error.message
-        if served.uses[CANARY] == self._ours[CANARY]:
+        if uses[CANARY] == self._ours[CANARY]:
             self._change(lambda client: client.canary(name, None))
         # The listing has no shadow that is in production itself.
-        if SHADOW in self._ours and version in (served.uses[SHADOW], served.uses[IN_USE]):
+        if SHADOW in self._ours and version in (uses[SHADOW], uses[IN_USE]):
             self._change(lambda client: client.shadow(name, None))
-        uses = self._served().uses
+        uses = self._served()[1]
         return Outcome(outcome, f"{why}; {uses[IN_USE]} is in production, the canary is {uses[CANARY]}")
 
     # Ask the servers.
 
-    def _served(self) -> _Served:
-        """Return the plan of the policy, without versions if it is not served.
+    def _served(self) -> tuple[list[str], dict[str, str]]:
+        """Return the policy's versions, and what production, the canary (such as "2=0.1") and the shadow are.
 
-        Raises RlservoError, also for an older plan.
+        No versions and "none" if it is not served. Raises RlservoError, also for an older plan.
         """
         with self._connect(self._terms.urls[0]) as client:
             listing = client.listing()
         try:
             generation = int(listing["generation"])
-            if generation < self._generation:  # of a worker or replica that has not followed yet
-                raise UnavailableError(f"the server follows plan {generation}, not yet {self._generation}")
-            self._generation = generation
-            uses: dict[str, str] = {IN_USE: "none", CANARY: "none", SHADOW: "none"}
-            versions: list[str] = []
-            for policy in listing["policies"]:
-                if policy["name"] == self._terms.policy:
-                    canary, shadow, aliases = policy["canary"], policy["shadow"], policy["aliases"]
-                    versions, uses[IN_USE] = policy["versions"], policy["version"]
-                    if canary:
-                        uses[CANARY] = f"{aliases.get(canary['version'], canary['version'])}={canary['share']:g}"
-                    if shadow:
-                        uses[SHADOW] = shadow["version"]
-            last_change = f"the last change was '{listing['changed_by']}', at {listing['changed_at'][:19]} UTC"
-            return _Served(last_change, versions, uses)
+            if generation < self._state.generation:  # of a worker or replica that has not followed yet
+                raise UnavailableError(f"the server follows plan {generation}, not yet {self._state.generation}")
+            self._state.generation = generation
+            self._last_change = f"the last change was '{listing['changed_by']}', at {listing['changed_at'][:19]} UTC"
+            named: dict[str, Any] = {each["name"]: each for each in listing["policies"]}
+            policy = named.get(self._terms.policy, {})
+            canary, shadow = policy.get("canary"), policy.get("shadow")
+            return policy.get("versions", []), {
+                IN_USE: policy.get("version", "none"),
+                CANARY: f"{canary['version']}={canary['share']:g}" if canary else "none",
+                SHADOW: shadow["version"] if shadow else "none",
+            }
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise UnavailableError(f"the server's listing cannot be read ({error!r})") from None
 
@@ -321,7 +311,7 @@ class Promotion:
     def _change(self, change: Callable[[AdminClient], dict[str, Any]]) -> None:
         """Make a change. Raises RlservoError."""
         with self._connect(self._terms.urls[0]) as client:
-            self._generation = int(change(client)["generation"])
+            self._state.generation = int(change(client)["generation"])
 
     @property
     def _remaining(self) -> float:

@@ -18,9 +18,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from prometheus_client.parser import text_string_to_metric_families
+from pydantic import ConfigDict
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
 
+PLAN, LOADED = "rlservo_plan_generation", "rlservo_policy_loaded"
 ANSWERS, OUTCOMES, ENDS = "rlservo_request_seconds_bucket", "rlservo_requests_total", "rlservo_episode_ends_total"
 DIFFERENCES, MISSED = "rlservo_shadow_difference_bucket", "rlservo_shadow_missed_total"
 COUNTED = {  # the labels that distinguish a policy's series; those of other labels are summed
@@ -50,21 +52,20 @@ def read_metrics(text: str, policy: str) -> dict[str, Process]:
     """Return the processes in a text for Prometheus, by name. Raises UntrustedError, and UnavailableError for none."""
     processes: dict[str, Process] = {}
     try:
-        for family in text_string_to_metric_families(text):
-            for name, labels, value, *_ in family.samples:
-                process = Process() if (replica := labels.get("replica", "")) not in processes else processes[replica]
-                if name == "rlservo_plan_generation":
-                    process.plan = value
-                elif name == "rlservo_policy_loaded" and labels["policy"] == policy:
-                    process.versions.add(labels["version"])
-                elif name in COUNTED and labels["policy"] == policy:
-                    if not 0 <= value < math.inf:
-                        raise UntrustedError(f"replica '{replica}' has {value} for {name} {labels}")
-                    path = "/".join((name, *(labels[label] for label in COUNTED[name])))
-                    process.numbers[path] = process.numbers.get(path, 0.0) + value
-                else:
-                    continue
-                processes[replica] = process
+        families = text_string_to_metric_families(text)
+        for name, labels, value, *_ in (sample for family in families for sample in family.samples):
+            if name != PLAN and (name not in (LOADED, *COUNTED) or labels["policy"] != policy):
+                continue
+            process = processes.setdefault(labels.get("replica", ""), Process())
+            if name == PLAN:
+                process.plan = value
+            elif name == LOADED:
+                process.versions.add(labels["version"])
+            elif not 0 <= value < math.inf:
+                raise UntrustedError(f"{name} {labels} is {value}")
+            else:
+                path = "/".join((name, *(labels[label] for label in COUNTED[name])))
+                process.numbers[path] = process.numbers.get(path, 0.0) + value
     except (ValueError, KeyError) as error:
         raise UntrustedError(f"the metrics cannot be read: {error!r}") from None
     if not processes:
@@ -93,6 +94,7 @@ def buckets(numbers: Mapping[str, float], *path: str) -> list[tuple[float, float
 class Counts:
     """Sums over all processes since a promotion began."""
 
+    __pydantic_config__ = ConfigDict(extra="forbid")  # when it is read from a log
     total: Numbers = field(default_factory=dict)
     seen: dict[str, Numbers] = field(default_factory=dict)
     """Each process' own numbers when it was last seen."""

@@ -13,23 +13,19 @@ from typing import Any, BinaryIO
 
 from rlservo.export.contract.errors import UsageError
 
-END = "end"
-
 
 class PromotionLog:
     """A file that one process at a time appends to."""
 
     def __init__(self, path: Path, file: BinaryIO) -> None:
-        """Read the promotion that has not ended. Raises UsageError for another kind of file."""
-        self.path = path
-        self._file = file
-        *lines, torn = file.read().split(b"\n")
-        self._is_torn = bool(torn)  # by a process that was killed while it wrote
-        entries = [entry for line in lines if (entry := _entry(line)) is not None]
-        if lines and not entries:
+        """Read the last line, but not one that a killed process left unfinished. Raises UsageError for another file."""
+        self.path, self._file = path, file
+        content = file.read()
+        *lines, torn = content.split(b"\n")
+        if content and not content.startswith(b'{"time": '):
             raise UsageError(f"{path} is not a promotion's log: name another --log")
-        self.last = entries[-1] if entries and entries[-1]["event"] != END else None
-        """The newest entry of a promotion that has not ended."""
+        file.truncate(len(content) - len(torn))
+        self.last = lines[-1] if lines else b""
 
     @classmethod
     @contextlib.contextmanager
@@ -54,21 +50,13 @@ class PromotionLog:
                     path.unlink(missing_ok=True)
 
     def write(self, event: str, fields: dict[str, Any]) -> None:
-        """Append an entry and sync it to disk: the next step may not be undone. Raises UsageError."""
-        entry = {"time": datetime.now(timezone.utc).isoformat(timespec="milliseconds"), "event": event, **fields}
-        content = b"\n" * self._is_torn + json.dumps(entry).encode() + b"\n"
+        """Append a line and sync it to disk: the next step may not be undone. Raises UsageError."""
+        entry = {"time": datetime.now(timezone.utc).isoformat(timespec="milliseconds"), "event": event} | fields
+        content, size = json.dumps(entry).encode() + b"\n", os.fstat(self._file.fileno()).st_size
         try:
             while content:
                 content = content[self._file.write(content) :]
-                self._is_torn = bool(content)
             os.fsync(self._file)
-        except OSError as error:  # for example a full disk
+        except OSError as error:  # for example a full disk, which may have taken half of it
+            self._file.truncate(size)
             raise UsageError(f"the log {self.path} cannot be written: {error.strerror}") from None
-
-
-def _entry(line: bytes) -> dict[str, Any] | None:
-    with contextlib.suppress(ValueError):
-        entry = json.loads(line)
-        if isinstance(entry, dict) and {"time", "event", "terms"} <= entry.keys():
-            return entry
-    return None

@@ -33,7 +33,7 @@ class Serving:
         """
         self.settings = settings
         loader, files = version_loader(places, settings), plan_files(places, settings)
-        self.control = PlanFollower(loader, files, replica=replica)
+        self.control = PlanFollower(loader, files)
         self.app = create_app(
             lambda: self.control.store,
             settings,

@@ -18,15 +18,7 @@ from rlservo.serve_app.episodes.memory_sessions import MemorySessions, shorten
 from rlservo.serve_app.episodes.request import Request, SessionId, new_episode_id
 from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.runtime.policy import Policy, Step
-from rlservo.serve_app.versions.policy_store import (
-    NEEDS_LAST,
-    NEEDS_STATE,
-    Decision,
-    EpisodeNote,
-    EpisodeStep,
-    PolicyStore,
-    take_step,
-)
+from rlservo.serve_app.versions.policy_store import Decision, EpisodeNote, EpisodeStep, PolicyStore, take_step
 from rlservo.serve_app.wire.request_names import BELONGS_TO
 
 if TYPE_CHECKING:
@@ -35,6 +27,15 @@ if TYPE_CHECKING:
 NO_SHARED_SESSIONS = (
     "this server has several processes and no shared session store: carry the 'state' in each request "
     "({} begins an episode), use a WebSocket, or start the server with one worker or with --session-store redis://..."
+)
+CARRY = "send 'state' ({} begins an episode, then what the last reply gave)"
+SESSION = (
+    "begin a session ('session_id' with 'reset'; in the Open Inference Protocol 'sequence_id' with 'sequence_start')"
+)
+NEEDS_STATE = f"remembers its episode: {CARRY.replace('an episode', 'one')}, or the inputs 'state_in.*', or {SESSION}"
+NEEDS_LAST = (
+    f"has a limit on the step from one action to the next: {CARRY}, or 'last_action' (in the Open Inference Protocol "
+    f"an input, or 'sequence_start' for the first), or {SESSION}"
 )
 
 

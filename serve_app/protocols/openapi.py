@@ -78,14 +78,9 @@ class VersionStatus(BaseModel):
 
 
 class ShadowStatus(BaseModel):
-    """A version whose actions are computed only for comparison, with its counts in the answering process."""
+    """A version whose actions are computed only for comparison; the metrics have the differences."""
 
     version: str
-    compared: int
-    mean_difference: float | None
-    largest_difference: float | None
-    failed: int
-    left_out: int
 
 
 class PolicySummary(BaseModel):

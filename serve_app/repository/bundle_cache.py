@@ -14,16 +14,8 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 from rlservo.export.contract.bundle import load_bundle
-from rlservo.export.contract.errors import BundleError, RlservoError, UnavailableError, UsageError
-
-
-def default_folder(variable: str = "XDG_CACHE_HOME", below_home: str = ".cache") -> Path:
-    """Return the user's folder for what rlservo keeps. Raises UsageError."""
-    root = os.environ.get(variable)
-    try:
-        return (Path(root) if root else Path.home() / below_home) / "rlservo"
-    except RuntimeError:  # a container's user without a home
-        raise UsageError(f"this user has no home folder: name a folder in {variable}") from None
+from rlservo.export.contract.errors import BundleError, UnavailableError
+from rlservo.serve_app.repository.storage import locked
 
 
 class BundleCache:
@@ -34,20 +26,17 @@ class BundleCache:
         self._max_bytes = max_bytes
 
     @contextlib.contextmanager
-    def bundle(self, digest: str, place: str, fetch: Callable[[Path], None]) -> Iterator[Path]:
+    def bundle(self, digest: str, fetch: Callable[[Path], None]) -> Iterator[Path]:
         """Give the folder of a bundle, which stays until the block ends; `fetch` fills it unless it is here.
 
-        Raises what `fetch` raises, BundleError if it brings something else, and UnavailableError if the cache
-        cannot be used.
+        Raises what `fetch` raises, and UnavailableError if the cache cannot be used.
         """
         entry = self.folder / digest
         try:
-            with _locked(entry) as descriptor:
-                if _what_is_wrong(entry, digest):
+            with locked(entry) as descriptor:
+                if not _is_whole(entry, digest):
                     try:
                         fetch(entry)
-                        if wrong := _what_is_wrong(entry, digest):
-                            raise BundleError(f"{place}: {wrong.replace(f'{entry}/', '')}")
                     except BaseException:
                         shutil.rmtree(entry, ignore_errors=True)
                         raise
@@ -71,29 +60,13 @@ class BundleCache:
         for entry in sorted(entries, key=lambda each: each.stat().st_mtime):
             if sum(sizes.values()) <= self._max_bytes:
                 return
-            with contextlib.suppress(BlockingIOError), _locked(entry, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            with contextlib.suppress(BlockingIOError), locked(entry, fcntl.LOCK_EX | fcntl.LOCK_NB):
                 shutil.rmtree(entry)
                 del sizes[entry]
 
 
-@contextlib.contextmanager
-def _locked(entry: Path, how: int = fcntl.LOCK_EX) -> Iterator[int]:
-    """Make an entry's folder and lock it; wait for another process that fetches the same."""
-    while True:
-        entry.mkdir(mode=0o700, parents=True, exist_ok=True)
-        descriptor = os.open(entry, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(descriptor, how)
-            if entry.is_dir() and os.path.samestat(entry.stat(), os.fstat(descriptor)):  # or who had it removed it
-                yield descriptor
-                return
-        finally:
-            os.close(descriptor)
-
-
-def _what_is_wrong(entry: Path, digest: str) -> str:
+def _is_whole(entry: Path, digest: str) -> bool:
     try:
-        found = load_bundle(entry)
-    except RlservoError as error:
-        return error.message
-    return "" if found.digest == digest else f"its SHA256SUMS is another one than that of the hash {digest[:12]}..."
+        return load_bundle(entry).digest == digest
+    except BundleError:
+        return False

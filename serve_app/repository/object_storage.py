@@ -29,10 +29,6 @@ _SECRETS = re.compile(r"[A-Za-z0-9+/=_.~%-]{32,}|\b(AKIA|ASIA)[A-Z0-9]+")  # whi
 _CONDITIONS = {"IfNoneMatch": "If-None-Match", "IfMatch": "If-Match"}
 
 
-class _TooLongError(Exception):
-    """The reply has more bytes than it may."""
-
-
 @dataclass(frozen=True)
 class Reply:
     """Answer of a storage; the body of a success is elsewhere."""
@@ -112,12 +108,15 @@ class ObjectStorage:
         method: str,
         name: str,
         given: dict[str, str],
-        body: bytes = b"",
+        body: bytes | None = None,
         *,
         into: BinaryIO | None = None,
         most: int = 0,
     ) -> Reply:
-        """Send a request, and once more if the connection breaks or the storage is busy."""
+        """Send a request, and once more if the connection breaks or the storage is busy.
+
+        Raises UnavailableError, and BundleError beyond `most` bytes.
+        """
         place, into, reason = f"{self.uri}/{name}", into or io.BytesIO(), ""
         headers: dict[bytes | str, bytes | str] = {_CONDITIONS[key]: given[key] for key in given if key in _CONDITIONS}
         for _ in range(2):
@@ -125,10 +124,10 @@ class ObjectStorage:
             into.seek(0)
             into.truncate()
             try:
-                reply = self._exchange(url, headers, body if method == "put_object" else None, into, most)
-            except _TooLongError:
-                kind = UnavailableError if method == "list_objects_v2" else BundleError
-                raise kind(f"{place}: the storage sends more than the {most:,} bytes that it may") from None
+                reply = self._exchange(url, headers, body, into, most)
+            except BundleError as error:
+                error.prefix(place)
+                raise
             except TIMEOUTS:
                 raise UnavailableError(
                     f"{place} gave no answer within {self.timeout_s:.0f} s, or too slow a one"
@@ -148,7 +147,7 @@ class ObjectStorage:
     ) -> Reply:
         """Put a body or get one; write that of a success, never unpacked, into `into`.
 
-        Raises _TooLongError beyond `most` bytes, and httpcore's errors, or TIMEOUTS when connecting takes longer
+        Raises BundleError beyond `most` bytes, and httpcore's errors, or TIMEOUTS when connecting takes longer
         than the time-out, or the rest longer than that plus the time that the received bytes take at `SLOWEST`.
         """
         backend = DeadlineBackend()
@@ -165,7 +164,7 @@ class ObjectStorage:
                 backend.deadline.at = deadline + length / SLOWEST
                 if 200 <= reply.status < 300:
                     if length > most:
-                        raise _TooLongError
+                        raise BundleError(f"the storage sends more than the {most:,} bytes that it may")
                     into.write(block)
                 else:
                     refusal += block[:REFUSAL]

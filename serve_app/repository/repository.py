@@ -1,17 +1,31 @@
 """Bundles by name and version, in folders and behind URIs; distinguished by their hashes.
 
-A name or version in a request is only compared with those of the bundles; no path is made of it. Everything here
-blocks, indefinitely if a file system hangs: `versions/version_loader.py` calls it through `BlockingCalls`.
+A name or version in a request is only compared with those of the bundles; no path is made of it. What is in the cache
+needs no storage: servers continue, and start again, while the storage is unreachable. Everything here blocks,
+indefinitely if a file system hangs: `versions/version_loader.py` calls it through `BlockingCalls`.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rlservo.export.contract.bundle import DEFAULT_LIMITS, BundleLimits, digest_of, find_bundles, read_contract
+from rlservo.export.contract.bundle import (
+    DEFAULT_LIMITS,
+    MAX_FILES,
+    MAX_SUMS_BYTES,
+    SUMS_FILE,
+    BundleLimits,
+    digest_of,
+    find_bundles,
+    load_bundle,
+    read_contract,
+    read_sums,
+)
 from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import (
     BundleError,
@@ -22,11 +36,16 @@ from rlservo.export.contract.errors import (
     UnknownVersionError,
     UsageError,
 )
-from rlservo.serve_app.repository.bundle_cache import BundleCache, default_folder
-from rlservo.serve_app.repository.remote_repository import Key, RemoteRepository
-from rlservo.serve_app.repository.storage import TIMEOUT_S, is_uri, place_of
+from rlservo.serve_app.repository.bundle_cache import BundleCache
+from rlservo.serve_app.repository.index import INDEX, Index, check_file_type
+from rlservo.serve_app.repository.storage import TIMEOUT_S, FolderStorage, default_folder, place_of, storage_at
 
+if TYPE_CHECKING:
+    from rlservo.serve_app.repository.object_storage import ObjectStorage
+
+Key = tuple[str, str]  # (name, version)
 CACHE_BYTES = 10 << 30
+MAX_FILE_BYTES = 4 << 30  # where no limit is set
 
 
 @dataclass
@@ -34,8 +53,7 @@ class Listing:
     """Bundles and faults found by one look through all places."""
 
     found: dict[Key, tuple[str, str]] = field(default_factory=dict)  # (hash, where it is)
-    errors: dict[Key, RlservoError] = field(default_factory=dict)  # of what cannot be served
-    unread: list[UnavailableError] = field(default_factory=list)  # of storages that do not answer
+    errors: dict[Key, RlservoError] = field(default_factory=dict)  # of what cannot be served, and of places
 
     def add(self, key: Key, digest: str, place: str) -> None:
         """Add a bundle. A copy of one counts once; two different ones of the same version make neither usable."""
@@ -47,29 +65,28 @@ class Listing:
             )
 
     @property
-    def digests(self) -> dict[Key, str]:
-        """The hash of every bundle that can be served."""
-        return {key: digest for key, (digest, _) in self.found.items() if key not in self.errors}
+    def digests(self) -> dict[str, dict[str, str]]:
+        """The hash of every bundle that can be served, by name and version, oldest first."""
+        digests: dict[str, dict[str, str]] = {}
+        for key in sorted(self.found.keys() - self.errors.keys(), key=lambda key: version_key(key[1])):
+            digests.setdefault(key[0], {})[key[1]] = self.found[key][0]
+        return digests
 
-    @property
-    def wrong(self) -> list[RlservoError]:
-        """Everything that cannot be served or read."""
-        return [*self.errors.values(), *self.unread]
+    def check_read(self) -> None:
+        """Raise UnavailableError if a storage did not answer."""
+        for error in self.errors.values():
+            if isinstance(error, UnavailableError):
+                raise error
 
     def available(self, *, needs_all: bool) -> dict[str, dict[str, str]]:
-        """Return every bundle's hash by name and version, for a first plan.
+        """Return `digests` for a first plan; with `needs_all` no bundle may be broken.
 
-        With `needs_all` no bundle may be broken. Raises BundleError or UsageError, and UnavailableError if a storage
-        does not answer.
+        Raises BundleError or UsageError, and UnavailableError if a storage does not answer.
         """
-        if self.unread:
-            raise self.unread[0]
+        self.check_read()
         if needs_all:
-            raise_all(list(self.errors.values()))
-        hashes: dict[str, dict[str, str]] = {}
-        for (name, version), digest in sorted(self.digests.items(), key=lambda each: version_key(each[0][1])):
-            hashes.setdefault(name, {})[version] = digest
-        return hashes
+            raise_all(self.errors)
+        return self.digests
 
     def find(self, name: str, version: str | None) -> tuple[str, str]:
         """Return (version, hash) of a bundle; None is the newest one.
@@ -77,24 +94,23 @@ class Listing:
         Raises UnknownPolicyError or UnknownVersionError, the bundle's own error if it cannot be served, and
         UnavailableError if a storage that does not answer may have it.
         """
-        digests = {v: digest for (n, v), digest in self.digests.items() if n == name}
-        versions = sorted(digests, key=version_key)
-        if self.unread and (version is None or version not in versions):
-            raise self.unread[0]
-        wanted = version if version is not None else (versions[-1] if versions else None)
-        if wanted is not None and wanted in digests:
-            return wanted, digests[wanted]
+        versions = self.digests.get(name, {})
+        if version is None or version not in versions:
+            self.check_read()
+        wanted = version or next(reversed(versions), "")
+        if wanted in versions:
+            return wanted, versions[wanted]
         # The error of a broken bundle helps more than the statement that there is none.
         for key, error in self.errors.items():
             if key[0] == name and version in (key[1], None):
                 raise error
         if not self.found:
-            raise_all(list(self.errors.values()))
+            raise_all(self.errors)
         if not versions:
             known = ", ".join(sorted({n for n, _ in self.found})) or "none"
             raise UnknownPolicyError(f"the repository has no policy '{name[:64]}': it has {known}")
         raise UnknownVersionError(
-            f"the repository has no version '{str(version)[:32]}' of policy '{name}': it has {', '.join(versions)}"
+            f"the repository has no version {str(version)[:32]} of policy '{name}': it has {', '.join(versions)}"
         )
 
 
@@ -111,30 +127,31 @@ class Repository:
         timeout_s: float = TIMEOUT_S,
     ) -> None:
         """Bundles behind URIs are fetched into the folder `cache`. Raises UsageError."""
-        given = [place_of(place) for place in places]
+        given = [storage_at(place_of(place), timeout_s) for place in places]
         if not given:
             raise UsageError("no policy to serve: give at least one bundle folder")
-        self._paths = [Path(place) for place in given if not is_uri(place)]
+        self._paths = [Path(storage.uri) for storage in given if isinstance(storage, FolderStorage)]
+        self._storages = [storage for storage in given if not isinstance(storage, FolderStorage)]
         self._limits = limits
         self._seen: dict[tuple[str, str, str], Path] = {}
         """The folders of the last look, by name, version and hash."""
-        self._remote: list[RemoteRepository] = []
-        if uris := [place for place in given if is_uri(place)]:
-            bundles = BundleCache(Path(cache) if cache is not None else default_folder() / "bundles", cache_bytes)
-            self._remote = [RemoteRepository(uri, bundles, limits, timeout_s=timeout_s) for uri in uris]
+        if self._storages:
+            self._cache = BundleCache(Path(cache) if cache is not None else default_folder() / "bundles", cache_bytes)
 
     def look(self) -> Listing:
         """Look through all places."""
         listing = Listing()
         self._look_in_folders(listing)
-        for remote in self._remote:
+        for storage in self._storages:
             try:
-                for key, digest in remote.versions().items():
-                    listing.add(key, digest, f"{remote.uri}/{key[0]}/{key[1]}")
-            except UnavailableError as error:
-                listing.unread.append(error)
-            except BundleError as error:
-                listing.errors["", remote.uri] = error
+                index, tag = Index.read(storage)
+                if not (index.policies or tag):
+                    raise BundleError(f"{storage.uri} has no {INDEX}: nothing was published there (`rlservo publish`)")
+                for name, versions in index.policies.items():
+                    for version, digest in versions.items():
+                        listing.add((name, version), digest, f"{storage.uri}/{name}/{version}")
+            except RlservoError as error:
+                listing.errors["", storage.uri] = error
         return listing
 
     @contextlib.contextmanager
@@ -142,43 +159,65 @@ class Repository:
         """Give the folder of an accepted bundle, which stays until the block ends.
 
         Its files may have changed since: the loader compares every hash. Raises BundleTamperedError if the bundle of
-        that name and version has another hash by now, and what is wrong with it if it cannot be served.
+        that name and version has another hash by now, and what `Listing.find` raises if it cannot be served.
         """
-        errors: list[RlservoError] = []
-        key = (name, version)
-        folder = self._seen.get((*key, digest))
-        if self._paths and (folder is None or not _holds(folder, digest)):  # a look at all others takes longer
-            listing = Listing()
+        listing, folder = Listing(), self._seen.get((name, version, digest))
+        if folder is None or not _holds(folder, digest):  # a look at all others takes longer
             self._look_in_folders(listing)
-            folder = self._seen.get((*key, digest))
-            if folder is None and key in listing.found:
-                errors.append(
-                    BundleTamperedError(
-                        f"{listing.found[key][1]} is not the bundle that was accepted as version {version} of "
-                        f"'{name}' (its hashes differ): export changes under a new version, or load this one again"
-                    )
-                )
-            errors += [error for each, error in listing.errors.items() if each == key]
+            folder = self._seen.get((name, version, digest))
         if folder is not None:
             yield folder
-            return
-        for remote in self._remote:
-            with contextlib.ExitStack() as stack:
-                try:
-                    fetched = stack.enter_context(remote.fetch(name, version, digest))
-                except RlservoError as error:
-                    errors.append(error)
-                    continue
+        elif self._storages:
+            with self._cache.bundle(digest, partial(self._download, name, version, digest)) as fetched:
                 yield fetched
-                return
-        if not errors:
-            raise UnknownVersionError(f"the repository has no version '{version[:32]}' of policy '{name}' any more")
-        raise next((error for error in errors if isinstance(error, UnavailableError)), errors[0])
+        else:
+            listing.find(name, version)
+            raise exchanged(name, version, listing.found[name, version][1])
 
     def touch(self, digests: Collection[str]) -> None:
         """Mark bundles as used in the cache: they are served."""
-        for remote in self._remote[:1]:  # they share it
-            remote.cache.touch(digests)
+        if self._storages:
+            self._cache.touch(digests)
+
+    def _download(self, name: str, version: str, digest: str, entry: Path) -> None:
+        """Fetch a bundle from the first storage that has it.
+
+        Raises UnavailableError if any storage could not be read, else the first error.
+        """
+        errors: list[RlservoError] = []
+        for storage in self._storages:
+            try:
+                self._copy(storage, name, version, digest, entry)
+            except RlservoError as error:
+                errors.append(error)
+            else:
+                return
+        raise next((error for error in errors if isinstance(error, UnavailableError)), errors[0])
+
+    def _copy(self, storage: ObjectStorage, name: str, version: str, digest: str, entry: Path) -> None:
+        """Copy and check the files of a bundle. Raises UnavailableError, BundleError."""
+        place = f"{storage.uri}/{name}/{version}"
+
+        def copy(file: str, most: int) -> None:
+            try:
+                with (entry / file).open("wb") as stream:
+                    storage.copy(f"{name}/{version}/{file}", most, stream)
+            except FileNotFoundError:
+                raise BundleError(f"{place}/{file} is not there: the version was deleted, all or in part") from None
+
+        copy(SUMS_FILE, MAX_SUMS_BYTES)
+        found, sums = read_sums(entry)
+        if found != digest:
+            raise exchanged(name, version, place)
+        if len(sums) > MAX_FILES:
+            raise BundleError(f"{place} lists {len(sums)} files: at most {MAX_FILES}")
+        for file in sums:
+            check_file_type(file, place)
+            copy(file, self._limits.of(file)[0] or MAX_FILE_BYTES)
+        try:
+            load_bundle(entry)
+        except BundleError as error:
+            raise BundleError(f"{place}: {error.message.replace(f'{entry}/', '')}") from None
 
     def _look_in_folders(self, listing: Listing) -> None:
         """Add the bundles of the folders."""
@@ -208,11 +247,22 @@ def _holds(folder: Path, digest: str) -> bool:
         return False
 
 
-def raise_all(errors: Sequence[RlservoError]) -> None:
-    """Raise the error, or one that lists all of them."""
-    if len(errors) == 1:
-        raise errors[0]
-    if errors:
-        sentences = "; ".join(error.message for error in errors)
-        kind = UnavailableError if all(isinstance(error, UnavailableError) for error in errors) else BundleError
-        raise kind(f"{len(errors)} bundles cannot be served: {sentences}")
+def exchanged(name: str, version: str, place: object) -> BundleTamperedError:
+    """Return the error for a bundle that is no longer the one whose hash was accepted."""
+    return BundleTamperedError(
+        f"{place} is not the bundle that was accepted as version {version} of '{name}' (its hashes differ): export or "
+        "publish changes as a new version, or load this one again"
+    )
+
+
+def raise_all(errors: Mapping[Key, RlservoError]) -> None:
+    """Raise the error of a version, or one that lists all of them; its details have each version's reason."""
+    if not errors:
+        return
+    error = next(iter(errors.values()))
+    if len(errors) > 1:
+        kind = UnavailableError if all(isinstance(each, UnavailableError) for each in errors.values()) else BundleError
+        sentences = "; ".join(each.message for each in errors.values())
+        error = kind(f"{len(errors)} bundles cannot be served: {sentences}")
+    error.details["versions"] = [{"name": n, "version": v, "reason": e.message} for (n, v), e in errors.items()]
+    raise error

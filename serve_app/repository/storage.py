@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import hashlib
 import os
 import re
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
@@ -43,38 +46,74 @@ def place_of(place: str | Path) -> str:
     return parts.geturl()
 
 
-def object_storage(uri: str, timeout_s: float) -> ObjectStorage:
-    """Return the storage behind a URI; a call may take half of `timeout_s`, so that a hanging one is named in time.
+def default_folder(variable: str = "XDG_CACHE_HOME", below_home: str = ".cache") -> Path:
+    """Return the user's folder for what rlservo keeps. Raises UsageError."""
+    root = os.environ.get(variable)
+    try:
+        return (Path(root) if root else Path.home() / below_home) / "rlservo"
+    except RuntimeError:  # a container's user without a home
+        raise UsageError(f"this user has no home folder: name a folder in {variable}") from None
+
+
+def storage_at(place: str, timeout_s: float = TIMEOUT_S) -> ObjectStorage | FolderStorage:
+    """Return the storage at a place; a call to object storage may take half of `timeout_s`, to be named in time.
 
     Raises UsageError.
     """
+    if not is_uri(place):
+        return FolderStorage(Path(place))
     with needs_extra("remote", "httpcore"):
         from rlservo.serve_app.repository.object_storage import ObjectStorage
-    return ObjectStorage(uri, timeout_s=timeout_s / 2)
+    return ObjectStorage(place, timeout_s=timeout_s / 2)
+
+
+@contextlib.contextmanager
+def locked(folder: Path, how: int = fcntl.LOCK_EX) -> Iterator[int]:
+    """Make a folder and lock it until the block ends or the process does; give its descriptor."""
+    while True:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(descriptor, how)
+            # Or the process that had it locked has removed it.
+            if folder.is_dir() and os.path.samestat(folder.stat(), os.fstat(descriptor)):
+                yield descriptor
+                return
+        finally:
+            os.close(descriptor)
 
 
 class FolderStorage:
-    """Files below a folder, by the methods of `ObjectStorage` that plans need. Works on NFS."""
+    """Files below a folder, by the methods of `ObjectStorage` that plans and indexes need. Works on NFS."""
+
+    is_read_only = False
 
     def __init__(self, root: Path) -> None:
         self.uri = str(root)
         self._root = root
 
     def read(self, name: str, most: int) -> tuple[bytes, str]:
-        """Return a file of at most `most` bytes. Raises FileNotFoundError, UnavailableError if it cannot be read."""
+        """Return a file of at most `most` bytes, and its tag for `create`.
+
+        Raises FileNotFoundError, and UnavailableError if it cannot be read.
+        """
         file = self._root / name
         try:
             # Opening the folder has NFS ask its server what is new in it; a look for the file alone would not.
             os.close(os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY))
             with open_regular(file, most) as stream:
-                return b"".join(blocks(stream, most)), ""
+                content = b"".join(blocks(stream, most))
         except FileNotFoundError:
             raise
         except OSError as error:
             raise UnavailableError(f"{file} cannot be read: {error.strerror or error}") from None
+        return content, hashlib.sha256(content).hexdigest()
 
-    def create(self, name: str, content: bytes) -> bool:
-        """Write a file unless there is one; return whether it has this content now. Raises UnavailableError."""
+    def create(self, name: str, content: bytes, tag: str = "") -> bool:
+        """Write a file unless there is one; return whether it has this content now.
+
+        With a `tag` it replaces the file that was read with it. Raises UnavailableError.
+        """
         file = self._root / name
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
@@ -84,13 +123,18 @@ class FolderStorage:
                     stream.write(content)
                     stream.flush()
                     os.fsync(stream.fileno())
-                with contextlib.suppress(FileExistsError):
-                    os.link(beside, file)  # whole at once, and only if there is none
+                if tag:
+                    with locked(file.parent):
+                        if self.read(name, MAX_DOCUMENT_BYTES)[1] == tag:
+                            beside.replace(file)
+                else:
+                    with contextlib.suppress(FileExistsError):
+                        os.link(beside, file)  # whole at once, and only if there is none
             finally:
                 beside.unlink(missing_ok=True)
+            return self.read(name, MAX_DOCUMENT_BYTES)[0] == content
         except OSError as error:
             raise UnavailableError(f"{file} cannot be written: {error.strerror or error}") from None
-        return self.read(name, MAX_DOCUMENT_BYTES)[0] == content
 
     def names(self, folder: str) -> list[str]:
         """Return the names below a folder; none if it does not exist. Raises UnavailableError."""

@@ -9,7 +9,7 @@ from rlservo.serve_app.versions.plan_follower import VersionState
 
 
 def describe(handler: RequestHandler) -> dict[str, Any]:
-    """Return the reply to `GET /v1/policies`; states, counts and comparisons are this process's own.
+    """Return the reply to `GET /v1/policies`; states and counts are this process's own.
 
     `version` is the target of the alias `production`, `versions` are those that answer, the oldest first, `previous` is
     the target of a rollback of each alias. A version is `loading`, `ready` or `failed`. `generation` is the plan's
@@ -45,7 +45,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
                 "aliases": arranged.aliases,
                 "previous": {alias: earlier[-1] for alias, earlier in arranged.history.items() if earlier},
                 "canary": arranged.canary and arranged.canary.model_dump(),
-                "shadow": shadow and handler.shadows.describe(name, shadow.of, shadow.version),
+                "shadow": shadow and {"version": shadow.contract.version},
                 "version_states": versions,
             }
         )

@@ -6,13 +6,11 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
-from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import RequestError, UsageError
-from rlservo.serve_app.repository.repository import raise_all
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import plan_files, version_loader
 from rlservo.serve_app.versions.plan_commands import Changed, parse
-from rlservo.serve_app.versions.plan_writer import PlanWriter
+from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan
 
 
@@ -31,7 +29,7 @@ class OfflineCommands:
             given = parse(command, document)
         except RequestError as error:
             raise UsageError(error.message) from None
-        plan = asyncio.run(PlanWriter(self._loader, self._files).give(given, name))
+        plan = asyncio.run(PlanFollower(self._loader, self._files).write(given, name))
         return {**Changed.of(plan, name).model_dump(), "place": self._files.place}
 
     def listing(self) -> dict[str, Any]:
@@ -44,14 +42,14 @@ class OfflineCommands:
     async def _listing(self) -> dict[str, Any]:
         plan = await self._files.call(self._files.newest)
         listing = await self._loader.look()
-        digests, errors = listing.digests, listing.wrong
+        digests, errors = listing.digests, listing.errors.values()
         if plan is None and not digests:
-            raise_all(errors)
+            listing.available(needs_all=True)
         policies = {} if plan is None else plan.policies
         others: dict[str, list[str]] = {name: [] for name, policy in policies.items() if policy.versions}
-        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
-            if name not in policies or version not in policies[name].versions:
-                others.setdefault(name, []).append(version)
+        for name, versions in digests.items():
+            loaded = policies[name].versions if name in policies else {}
+            others[name] = [version for version in versions if version not in loaded]
         return {
             "place": self._files.place,
             "generation": 0 if plan is None else plan.generation,
@@ -63,5 +61,5 @@ class OfflineCommands:
 
 
 def _described(plan: Plan | None, name: str) -> dict[str, Any]:
-    changed = Changed.of(plan or Plan(generation=0, policies={}, changed_at="", changed_by=""), name)
+    changed = Changed.of(plan or Plan(generation=0, policies={}), name)
     return {"name": name, **changed.model_dump(exclude={"generation", "policy"})}

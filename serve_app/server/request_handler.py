@@ -190,7 +190,7 @@ class RequestHandler:
             self._check_batch(store, request)
         decision = await self.episodes.act(store, request)
         shadow = store.shadow(name)
-        if shadow is not None and decision.version == shadow.of and not request.explore:
+        if shadow is not None and decision.version == store.default(name) and not request.explore:
             self.shadows.offer(shadow, obs, decision)
         return decision
 
@@ -214,7 +214,7 @@ class RequestHandler:
         elif asked is not None:
             version = asked
         else:  # an alias counts as its version, no version as the default
-            version = store.default(name) if version is None else store.version_of(name, version)
+            version = store.default(name) if version is None else store.plans[name].version_of(version) or ""
         self.metrics.count_failure(request.protocol, name, version, counted_as or code)
         self.log.write_failure(request, code, sentence)
 

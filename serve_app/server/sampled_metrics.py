@@ -124,6 +124,6 @@ def sessions(handler: RequestHandler) -> None:
 
 def shadows(handler: RequestHandler) -> None:
     """Sample the actions without a shadow's comparison."""
-    for policy, version, shadow, reason, count in handler.shadows.missed():
+    for ((policy, version, shadow), reason), count in list(handler.shadows.missed.items()):
         which = {"policy": policy, "version": version, "shadow": shadow, "reason": reason}
         handler.metrics.sampled.counter("rlservo_shadow_missed", "Actions not compared with a shadow's", count, **which)

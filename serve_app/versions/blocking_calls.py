@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
@@ -27,23 +26,25 @@ Result = TypeVar("Result")
 
 
 class BlockingCalls:
-    """Runs functions in threads that can be given up."""
+    """Runs functions in threads that can be given up after `timeout_s`."""
 
-    def __init__(self, limit: int = LIMIT) -> None:
+    def __init__(self, timeout_s: float, limit: int = LIMIT) -> None:
+        self._timeout_s = timeout_s
         self._free = threading.Semaphore(limit)
 
-    async def run(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None, what: str) -> Result:
+    async def run(self, what: str, function: Callable[..., Result], *arguments: Any) -> Result:
         """Return what the function returns, as `wait` does."""
-        return await self.wait(self.start(function, *arguments, timeout_s=timeout_s), timeout_s=timeout_s, what=what)
+        return await self.wait(what, self.start(function, *arguments))
 
-    def start(self, function: Callable[..., Result], *arguments: Any, timeout_s: float | None = None) -> Future[Result]:
-        """Call a function once a thread is free, within `timeout_s`; it runs to its end even if no caller waits."""
+    def start(self, function: Callable[..., Result], *arguments: Any) -> Future[Result]:
+        """Call a function if a thread is free in time; it runs to its end even if no caller waits."""
         outcome: Future[Result] = Future()
         outcome.set_running_or_notify_cancel()  # it cannot be cancelled
 
         def call() -> None:
-            if not self._free.acquire(timeout=timeout_s):
-                return  # those who wait have given up
+            if not self._free.acquire(timeout=self._timeout_s):
+                outcome.set_exception(UnavailableError("could not start: other calls wait for the file system"))
+                return
             try:
                 settle: Callable[[], None] = partial(outcome.set_result, function(*arguments))
             except BaseException as error:
@@ -55,21 +56,22 @@ class BlockingCalls:
         threading.Thread(target=call, name="policies", daemon=True).start()
         return outcome
 
-    async def wait(self, outcome: Future[Result], *, timeout_s: float | None, what: str) -> Result:
+    async def wait(self, what: str, outcome: Future[Result]) -> Result:
         """Return a call's result; raise what it raises, and UnavailableError when it takes too long.
 
-        `what` names the activity in the error. A `timeout_s` of None waits for as long as it takes.
+        `what` names the activity in the error.
         """
-        began = time.monotonic()
+        left_s = self._timeout_s
         returned = asyncio.wrap_future(outcome)
         try:
-            while timeout_s is None or time.monotonic() - began < timeout_s:
-                left_s = SILENCE_S if timeout_s is None else timeout_s - (time.monotonic() - began)
+            while left_s > 0:
                 done, _ = await asyncio.wait([returned], timeout=min(SILENCE_S, left_s))
                 if done:
                     return returned.result()
-                if left_s >= SILENCE_S:
-                    logger.warning("waiting for %s (%.0f s)", what, time.monotonic() - began)
+                left_s -= SILENCE_S
+                if left_s > 0:
+                    logger.warning("waiting for %s (%.0f s)", what, self._timeout_s - left_s)
         finally:
             returned.cancel()  # if it has not returned, its result is no longer wanted
-        raise UnavailableError(f"{what} took longer than {timeout_s:g} s and was given up: does the file system hang?")
+        took = f"{what} took longer than {self._timeout_s:g} s"
+        raise UnavailableError(f"{took} and was given up: does the file system hang?")

@@ -15,11 +15,10 @@ from rlservo.export.contract.contract import first_fault, version_key
 from rlservo.export.contract.errors import (
     ConflictError,
     RequestError,
-    RlservoError,
-    UnknownPolicyError,
     UnknownVersionError,
 )
 from rlservo.serve_app.interface import PRODUCTION
+from rlservo.serve_app.repository.repository import Listing
 from rlservo.serve_app.versions.serving_plan import (
     Alias,
     Canary,
@@ -44,14 +43,10 @@ class Command(BaseModel):
     summary: ClassVar[str]
     nothing: ClassVar[str] = ""  # the word for a command without values
 
-    @property
-    def words(self) -> str:
-        """The command's values, for the plan and the logs."""
-        return " ".join(str(value) for _, value in self if value is not None) or self.nothing
-
     def line(self, name: str) -> str:
-        """Return the command in a line, for the plan and the logs."""
-        return f"{self.verb} {name} {self.words}".strip()
+        """Return the command as `rlservo policy` takes it, for the plan and the logs."""
+        values = "=".join(str(value or "") for field, value in self if field != "expected")
+        return f"{self.verb} {name} {values if values.strip('=') else self.nothing}".strip()
 
     def change(self, plan: Plan, name: str) -> Policies:
         """Return the policies after it. Raises UnknownPolicyError, UnknownVersionError, ConflictError, RequestError."""
@@ -81,17 +76,16 @@ class Load(Command):
         return command
 
     def change(self, plan: Plan, name: str) -> Policies:
-        return {**plan.policies, name: self.changed(name, plan.policies.get(name) or PolicyPlan(versions={}))}
+        return {**plan.policies, name: self.changed(name, plan.policies.get(name) or PolicyPlan())}
 
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
-        version = str(self.version)
-        uses = _uses(policy, version)
-        if uses and policy.versions[version] != self._digest:
-            raise ConflictError(
-                f"policy '{name}' version {version} is in use by {uses}, but its folder now holds another bundle: "
-                "export changes under a new version, or point that elsewhere first"
-            )
-        return _changed(name, policy, versions={**policy.versions, version: self._digest})
+        return _changed(name, policy, versions={**policy.versions, str(self.version): self._digest})
+
+
+class Poll(Load):
+    """Add a newer version that a server has found by itself."""
+
+    verb = "poll"
 
 
 class Unload(Command):
@@ -106,8 +100,6 @@ class Unload(Command):
         _require(name, policy, version)
         if len(policy.versions) == 1:
             raise ConflictError(f"version {version} is the last of policy '{name}': unload the policy itself")
-        if uses := _uses(policy, version):
-            raise ConflictError(f"policy '{name}' version {version} is in use by {uses}: point that elsewhere first")
         return _changed(name, policy, versions={v: each for v, each in policy.versions.items() if v != version})
 
 
@@ -125,16 +117,15 @@ class SetAlias(Command):
         None, description="Version that the alias points to now; if it points elsewhere, nothing changes."
     )
 
-    @property
-    def words(self) -> str:
-        return f"{self.alias}={self.version or ''}"
-
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
-        alias = self.alias
-        if policy.aliases.get(alias) != self.version:
-            _expect(policy, name, alias, self.expected)
+        alias, version = self.alias, policy.aliases.get(self.alias)
+        if version != self.version and self.expected not in (None, version):
+            now = f"points to {version}" if version is not None else "is gone"
+            raise ConflictError(
+                f"the alias '{alias}' of policy '{name}' {now}, but was expected to point to {self.expected}: "
+                "someone moved it"
+            )
         if self.version is not None:
-            _require(name, policy, self.version)
             return _changed(name, policy, aliases={**policy.aliases, alias: self.version})
         if alias not in policy.aliases:
             raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(policy.aliases)}")
@@ -143,9 +134,6 @@ class SetAlias(Command):
                 f"the alias '{PRODUCTION}' of policy '{name}' names the version for clients that name none: point it "
                 "elsewhere, or unload the policy"
             )
-        for use, reference in policy.uses.items():
-            if reference == alias:
-                raise ConflictError(f"the alias '{alias}' of policy '{name}' is in use by {use}: end that first")
         return _changed(name, policy, aliases={a: v for a, v in policy.aliases.items() if a != alias})
 
 
@@ -155,19 +143,9 @@ class Rollback(Command):
     verb = "rollback"
     summary = "Point an alias back to its previous version"
     alias: Alias = Field(PRODUCTION, description="The alias; `production` by default.")
-    expected: Version | None = Field(
-        None,
-        description="Version that the alias points to now; if it points elsewhere, nothing changes. Makes a repeated "
-        "command safe.",
-    )
-
-    @property
-    def words(self) -> str:
-        return self.alias
 
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
         alias = self.alias
-        _expect(policy, name, alias, self.expected)
         *earlier, version = policy.history.get(alias, ()) or ("",)
         if not version:
             raise ConflictError(f"the alias '{alias}' of policy '{name}' has no previous version to roll back to")
@@ -181,13 +159,14 @@ class SetCanary(Command):
     nothing = "off"
     summary = "Give another version a share of the sessions"
     version: Reference | None = Field(description="A loaded version or an alias; null ends the canary.")
-    share: float | None = Field(None, ge=0, le=1, description="Share of the sessions; 0 ends the canary.")
+    share: float | None = Field(None, gt=0, le=1, description="Share of the sessions.")
 
     def changed(self, name: str, policy: PolicyPlan) -> PolicyPlan:
-        if self.version is not None and self.share is None:
+        if self.version is None:
+            return _changed(name, policy, canary=None)
+        if self.share is None:
             raise RequestError(f"the canary of policy '{name}' needs a share above 0 and at most 1")
-        canary = Canary(version=self.version, share=self.share) if self.version and self.share else None
-        return _changed(name, policy, canary=canary)
+        return _changed(name, policy, canary=Canary(version=self.version, share=self.share))
 
 
 class SetShadow(Command):
@@ -200,8 +179,9 @@ class SetShadow(Command):
         return _changed(name, policy, shadow=self.version)
 
 
-KINDS: tuple[type[Command], ...] = (Load, Unload, SetAlias, Rollback, SetCanary, SetShadow)
-COMMANDS = {kind.verb: kind for kind in KINDS}
+COMMANDS: dict[str, type[Command]] = {
+    kind.verb: kind for kind in (Load, Unload, SetAlias, Rollback, SetCanary, SetShadow)
+}
 
 
 class Changed(BaseModel):
@@ -218,7 +198,7 @@ class Changed(BaseModel):
     @classmethod
     def of(cls, plan: Plan, name: str) -> Changed:
         """Return a policy's state in a plan."""
-        policy = plan.policies.get(name) or PolicyPlan(versions={})
+        policy = plan.policies.get(name) or PolicyPlan()
         state = {field: getattr(policy, field) for field in ("default", "aliases", "canary", "shadow")}
         return cls(generation=plan.generation, policy=name, versions=list(policy.versions), **state)
 
@@ -231,72 +211,76 @@ def parse(command: str, document: dict[str, Any]) -> Command:
         raise RequestError(f"{command}: {first_fault(error, shows_input=True)}") from None
 
 
-def first_policies(config: ServedConfig, available: Mapping[str, Mapping[str, str]]) -> Policies:
-    """Return the policies of a configuration, given the repository's bundles (name -> version -> hash).
+def first_policies(config: ServedConfig, listing: Listing) -> Policies:
+    """Return the policies of a configuration, given the repository's bundles; none may be broken if it means all.
 
-    Raises UnknownPolicyError, UnknownVersionError, ConflictError.
+    Raises what `Listing.find` and `Listing.available` raise, and ConflictError.
     """
+    means_all = config.unlisted == "load" or any(policy.versions is None for policy in config.policies.values())
+    available = listing.available(needs_all=means_all)
     unlisted = available if config.unlisted == "load" else ()
     policies = {}
     for name, wanted in sorted(({name: PolicyConfig() for name in unlisted} | config.policies).items()):
-        digests = available.get(name)
-        if digests is None:
-            raise UnknownPolicyError(f"the repository has no policy '{name}': it has {_listed(sorted(available))}")
-        for version in wanted.versions or ():
-            if version not in digests:
-                raise UnknownVersionError(
-                    f"the repository has no version {version} of policy '{name}': it has {_listed(digests)}"
-                )
-        versions = {version: digests[version] for version in (digests if wanted.versions is None else wanted.versions)}
+        if wanted.versions is not None:
+            versions = dict(listing.find(name, version) for version in wanted.versions)
+        elif not (versions := available.get(name, {})):
+            listing.find(name, None)  # which raises
         policies[name] = _changed(
-            name, PolicyPlan(versions={}), versions=versions,
+            name, PolicyPlan(), versions=versions,
             aliases=wanted.aliases, canary=wanted.canary, shadow=wanted.shadow,
         )  # fmt: skip
     return policies
 
 
 def agrees(plan: Plan, config: ServedConfig) -> bool:
-    """Return whether a plan serves what a configuration means; one that does not name `production` leaves it open."""
-    known = {name: each.versions for name, each in plan.policies.items() if each.versions}
-    try:
-        differing = differences(plan.policies, first_policies(config, known))
-    except RlservoError:
-        return False
-    return all(
-        (field, key) == ("aliases", PRODUCTION) and PRODUCTION not in config.policies.get(name, PolicyConfig()).aliases
-        for name, field, key in differing
-    )
+    """Return whether a plan serves what a configuration names."""
+    for name, wanted in config.policies.items():
+        policy = plan.policies.get(name, PolicyPlan())
+        if wanted.versions is not None and set(wanted.versions) != set(policy.versions):
+            return False
+        if not wanted.aliases.items() <= policy.aliases.items():
+            return False
+        if (wanted.canary, wanted.shadow) != (policy.canary, policy.shadow):
+            return False
+    served = {name for name, policy in plan.policies.items() if policy.versions}
+    return config.unlisted == "load" or served <= config.policies.keys()
 
 
-def differences(before: Mapping[str, PolicyPlan], after: Mapping[str, PolicyPlan]) -> dict[tuple[str, str, str], Any]:
-    """Return what is served differently after than before, by policy, field and version or alias."""
-    changed: dict[tuple[str, str, str], Any] = {}
-    for name in before.keys() | after.keys():
-        was, now = (policies.get(name) or PolicyPlan(versions={}) for policies in (before, after))
-        for field, old, new in (("versions", was.versions, now.versions), ("aliases", was.aliases, now.aliases)):
-            changed |= {(name, field, key): new.get(key) for key in old | new if old.get(key) != new.get(key)}
-        for field in ("canary", "shadow"):
-            if getattr(was, field) != getattr(now, field):
-                changed[name, field, ""] = getattr(now, field)
-    return changed
+def differences(before: Policies, after: Policies, name: str) -> dict[str, Any]:
+    """Return what is served differently of a policy after than before, by version, alias and use."""
+
+    def served(policies: Policies) -> dict[str, Any]:
+        policy = policies.get(name, PolicyPlan())
+        versions = {f"version {version}": digest for version, digest in policy.versions.items()}
+        return {**versions, **policy.uses, "the canary": policy.canary}
+
+    was, now = served(before), served(after)
+    return {key: now.get(key) for key in was.keys() | now.keys() if was.get(key) != now.get(key)}
 
 
 def _changed(name: str, was: PolicyPlan, **changes: Any) -> PolicyPlan:
-    """Return a policy with these changes: versions sorted, no use without a loaded version, the way back kept."""
-    values: dict[str, Any] = {field: getattr(was, field) for field in PolicyPlan.model_fields} | changes
-    versions = _sorted(values["versions"])
-    aliases: dict[str, str] = dict(values["aliases"])
+    """Return a policy with these changes: versions sorted, each use with its loaded bundle, the way back kept."""
+    versions = _sorted(changes.get("versions", was.versions))
+    if len({version_key(version) for version in versions}) != len(versions):
+        raise ConflictError(f"policy '{name}': two versions compare equal, as '1' and '1.0.0' do: keep one of them")
+    aliases: dict[str, str] = dict(changes.get("aliases", was.aliases))
     if versions and PRODUCTION not in aliases:
         aliases[PRODUCTION] = list(versions)[-1]
     unloaded = {v: digest for v, digest in _sorted({**was.unloaded, **was.versions}).items() if v not in versions}
-    values |= {"versions": versions, "aliases": aliases, "history": _moved(was, aliases), "unloaded": unloaded}
-    try:
-        policy = PolicyPlan(**values)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ConflictError(f"policy '{name}': {first['msg'].removeprefix('Value error, ')}") from None
-    for reference in policy.uses.values():
-        _require(name, policy, reference)
+    changes |= {"versions": versions, "aliases": aliases, "history": _moved(was, aliases), "unloaded": unloaded}
+    policy = was.model_copy(update=changes)
+    lost: dict[str, list[str]] = {}  # uses by the version that they had
+    for use, reference in policy.uses.items():
+        had = was.version_of(reference)
+        if had is None:
+            _require(name, policy, reference)
+        elif policy.version_of(reference) is None or versions[had] != was.versions[had]:
+            lost.setdefault(had, []).append(use)
+    for version, uses in lost.items():
+        raise ConflictError(
+            f"policy '{name}' version {version} is in use by {' and '.join(uses)}: end that or point it elsewhere "
+            "first, and export changes of a bundle under a new version"
+        )
     return policy
 
 
@@ -310,21 +294,6 @@ def _moved(policy: PolicyPlan, aliases: Mapping[str, str]) -> dict[str, tuple[st
         if history.get(alias, ())[-1:] == (version,):
             history[alias] = history[alias][:-1]
     return history
-
-
-def _uses(policy: PolicyPlan, version: str) -> str:
-    """Return everything that points to a version, in words."""
-    return " and ".join(use for use, reference in policy.uses.items() if policy.version_of(reference) == version)
-
-
-def _expect(policy: PolicyPlan, name: str, alias: str, expected: str | None) -> None:
-    """Raise ConflictError unless an alias points to the version that the caller expects, if any."""
-    version = policy.aliases.get(alias)
-    if expected not in (None, version):
-        now = f"points to {version}" if version is not None else "is gone"
-        raise ConflictError(
-            f"the alias '{alias}' of policy '{name}' {now}, but was expected to point to {expected}: someone moved it"
-        )
 
 
 def _require(name: str, policy: PolicyPlan, reference: str) -> None:

@@ -22,14 +22,14 @@ from pydantic import ValidationError
 from rlservo.export.contract.bundle import CONTRACT_FILE
 from rlservo.export.contract.contract import first_fault
 from rlservo.export.contract.errors import UnavailableError
-from rlservo.serve_app.repository.bundle_cache import default_folder
 from rlservo.serve_app.repository.storage import (
     MAX_DOCUMENT_BYTES,
     TIMEOUT_S,
     FolderStorage,
+    default_folder,
     is_uri,
-    object_storage,
     place_of,
+    storage_at,
 )
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.serving_plan import Plan
@@ -63,7 +63,7 @@ class PlanFiles:
         self._root = None if root is None else place_of(root)
         self._cache = cache
         self._timeout_s = timeout_s
-        self._calls = BlockingCalls()
+        self._calls = BlockingCalls(timeout_s)
 
     @property
     def place(self) -> str:
@@ -77,8 +77,7 @@ class PlanFiles:
 
     async def call(self, method: Callable[..., Result], *arguments: Any) -> Result:
         """Call a method below. Raises what it raises, and UnavailableError when it takes too long."""
-        what = "reading or writing the plan of what is served"
-        return await self._calls.run(method, *arguments, timeout_s=self._timeout_s, what=what)
+        return await self._calls.run("reading or writing the plan of what is served", method, *arguments)
 
     def newest(self) -> Plan | None:
         """Return the newest plan, if there is one. Raises UnavailableError."""
@@ -109,8 +108,7 @@ class PlanFiles:
 
     @functools.cached_property
     def _storage(self) -> ObjectStorage | FolderStorage:
-        root = self._root or _first_writable(self._places)
-        return object_storage(root, self._timeout_s) if is_uri(root) else FolderStorage(Path(root))
+        return storage_at(self._root or _first_writable(self._places), self._timeout_s)
 
     @functools.cached_property
     def _copy(self) -> Path | None:

@@ -1,8 +1,8 @@
 """Versions that one process serves: it follows the plan, and carries out commands that change it.
 
-A process replaces its store as a whole, and keeps the old one if it cannot follow. Bundles and plans are read in
-threads with a time-out, and nothing is locked meanwhile: requests and other changes continue, also if a file system
-hangs.
+A change is proven here, written under the plan's next number, and refused if a conflicting one came first. A process
+replaces its store as a whole, and keeps the old one if it cannot follow. Bundles and plans are read in threads with a
+time-out, and nothing is locked meanwhile: requests and other changes continue, also if a file system hangs.
 """
 
 from __future__ import annotations
@@ -16,18 +16,25 @@ from dataclasses import dataclass
 from typing import Any
 
 from rlservo.export.contract.contract import version_key
-from rlservo.export.contract.errors import BundleError, RefusedError, RlservoError, UnavailableError
-from rlservo.serve_app.repository.remote_repository import Key
+from rlservo.export.contract.errors import (
+    BundleError,
+    ConflictError,
+    RefusedError,
+    RlservoError,
+    UnavailableError,
+    UsageError,
+)
+from rlservo.serve_app.repository.repository import Key
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.versions.plan_commands import Command, Load, agrees
+from rlservo.serve_app.versions.plan_commands import Command, Load, Poll, agrees, differences, first_policies
 from rlservo.serve_app.versions.plan_files import PlanFiles
-from rlservo.serve_app.versions.plan_writer import PlanWriter
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig, timestamp
-from rlservo.serve_app.versions.version_loader import Loadable, VersionLoader
+from rlservo.serve_app.versions.serving_plan import Loadable, Plan, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.version_loader import VersionLoader
 
 logger = logging.getLogger(__name__)
 
+ATTEMPTS = 10  # at a number, while others change something else
 RETRY_PERIOD_S = 30.0  # [s] between attempts at a version that could not be loaded
 REFUSED_PERIOD_S = 300.0  # [s] between attempts at a new version that was refused, when no command asked for it
 
@@ -44,14 +51,11 @@ class VersionState:
 class PlanFollower:
     """Versions that this process serves, and their changes."""
 
-    def __init__(self, loader: VersionLoader, files: PlanFiles, *, replica: str = "") -> None:
+    def __init__(self, loader: VersionLoader, files: PlanFiles) -> None:
         self.store: PolicyStore | None = None
         self.plan: Plan | None = None
-        self.replica = replica
         self._loader = loader
         self._files = files
-        self._writer = PlanWriter(loader, files)
-        self._served: dict[str, set[str]] = {}  # every identity that was ever served here, by name
         self._failed: dict[Loadable, RlservoError] = {}  # why this process serves something older than the plan
         self._refused: dict[Key, str] = {}  # by the last command that this process carried out
         self._refused_until: dict[Loadable, float] = {}  # new versions that polling leaves out for a while
@@ -63,14 +67,25 @@ class PlanFollower:
         """Why this process serves something older than the plan, a sentence per version."""
         return tuple(error.message for error in self._failed.values())
 
+    # Change the plan.
+
     async def configure(self, document: Any) -> None:
         """Serve the plan; if the repository has none yet, first write the one that a configuration means.
 
-        Raises UsageError, BundleError and UnavailableError.
+        If object storage is unreachable, the last plan that this machine has read is used. Raises UsageError,
+        BundleError and UnavailableError.
         """
         self._config = ServedConfig.parse(document)
-        plan = await self._writer.at_start(self._config)
-        if document and not agrees(plan, self._config):
+        try:
+            plan = await self._files.call(self._files.newest)
+        except UnavailableError as error:
+            plan = await self._files.call(self._files.remembered)
+            if plan is None:
+                raise
+            logger.warning("%s: serving plan %d, the last one that was seen here", error.message, plan.generation)
+        if plan is None:
+            plan = await self._write(await self._unwritten(), None, "")
+        elif document and not agrees(plan, self._config):
             logger.warning(
                 "plan %d in %s (%s) differs from the configuration and is used: `rlservo policy` changes it",
                 plan.generation,
@@ -79,11 +94,12 @@ class PlanFollower:
             )
         await self._apply(plan)
 
-    async def give(self, command: Command, name: str, *, by: str = "") -> Plan:
-        """Carry out a command as `PlanWriter.give` does; return the plan when this process serves it."""
+    async def give(self, command: Command, name: str) -> Plan:
+        """Carry out a command on a policy as `write` does; return the plan when this process serves it."""
         self._refused = {}
+        self._generation()
         try:
-            plan = await self._writer.give(command, name, by=by, known=self._generation())
+            plan = await self.write(command, name)
         except RefusedError as error:
             refused = error.details.get("versions", ())
             self._refused = {(each["name"], each["version"]): each["reason"] for each in refused}
@@ -91,10 +107,66 @@ class PlanFollower:
         await self._apply(plan)
         return plan
 
+    async def write(self, command: Command, name: str) -> Plan:
+        """Carry out a command on a policy, for others to serve; return the plan with it.
+
+        Nothing has changed when this raises: what `Command.change` and `Listing.find` raise, RefusedError if a version
+        cannot be served, UnavailableError if something could not be read or written, and ConflictError if another
+        command changed the same alias, version, canary or shadow at the same time.
+        """
+        try:
+            if isinstance(command, Load):
+                command = Load.of(*(await self._loader.look()).find(name, command.version))
+            before = await self._files.call(self._files.newest)
+            known = 0 if self.plan is None else self.plan.generation
+            if (0 if before is None else before.generation) < known:
+                raise UnavailableError(f"{self._files.place} has lost plan {known}, which is served here")
+            return await self._write(before or await self._unwritten(), command, name)
+        except (BundleError, UsageError) as error:  # of the repository, of the proof
+            raise RefusedError(f"refused, and nothing has changed: {error.message}", error.details) from None
+
+    async def _write(self, before: Plan, command: Command | None, name: str) -> Plan:
+        """Write the plan after a command (None: the first plan, as it is), unless another one came first."""
+        for _ in range(ATTEMPTS):
+            policies = before.policies if command is None else command.change(before, name)
+            if policies == before.policies and before.generation:
+                return before
+            await self._loader.prove(policies, before.policies if before.generation else {})
+            plan = before.after(policies, "configuration" if command is None else command.line(name))
+            try:
+                if await self._files.call(self._files.create, plan):
+                    return plan
+            except UnavailableError as error:
+                if before.generation:
+                    raise
+                raise UnavailableError(
+                    f"{error.message}: the first plan could not be written; RLSERVO_PLAN names another place for it, "
+                    "and `rlservo policy load NAME --repository PLACE` writes it for servers that only read"
+                ) from None
+            first = await self._files.call(self._files.newest)
+            if first is None:
+                raise UnavailableError(f"{self._files.place} has lost the plan that was just there")
+            ours, theirs = (differences(before.policies, each, name) for each in (policies, first.policies))
+            if ours.items() <= theirs.items():
+                return first  # another operator has given the same command
+            if any(key in theirs and theirs[key] != value for key, value in ours.items()):
+                raise ConflictError(
+                    f"another command came first (plan {first.generation}: {first.changed_by}), and this one has "
+                    "changed nothing: look at `rlservo policy list`, and repeat it if it still applies"
+                )
+            before = first
+        raise UnavailableError("other commands keep changing the plan: try again")
+
+    async def _unwritten(self) -> Plan:
+        """Return the plan before the first, which is not written."""
+        return Plan(generation=0, policies=first_policies(self._config, await self._loader.look()))
+
     def _generation(self) -> int:
         if self.plan is None:
             raise UnavailableError("the policies are still being loaded: try again shortly")
         return self.plan.generation
+
+    # Follow the plan.
 
     async def follow(self) -> None:
         """Serve the newest plan if another one is served, and try again what could not be loaded a while ago."""
@@ -107,20 +179,15 @@ class PlanFollower:
 
     async def poll_plan(self) -> None:
         """Follow the plans that others write, until cancelled."""
-        warning = asyncio.create_task(self._warn_of_newer())  # the plan is followed even if that hangs
-        try:
-            await _always(self._files.poll_s, self.follow, "the plan cannot be followed")
-        finally:
-            warning.cancel()
+        always = _always(self._files.poll_s, self.follow, "the plan cannot be followed")
+        await asyncio.gather(self._warn_of_newer(), always)  # the plan is followed even if the look hangs
 
     async def _warn_of_newer(self) -> None:
-        with contextlib.suppress(UnavailableError):
-            newer = ", ".join(" ".join(key) for key in self._newer((await self._loader.look()).digests)[:10])
-            if newer:
-                number = self._generation()
-                logger.warning(
-                    "newer than the versions of plan %d, and not loaded: %s (`rlservo policy load`)", number, newer
-                )
+        with contextlib.suppress(Exception):  # the repository may be out of reach
+            if newer := self._newer((await self._loader.look()).digests):
+                shown = ", ".join(" ".join(key) for key in newer[:10])
+                newest = f"newer than the versions of plan {self._generation()}, and not loaded: {shown}"
+                logger.warning("%s (`rlservo policy load`)", newest)
 
     async def poll_repository(self, period_s: float) -> None:
         """Load versions newer than all that the plan knows of a policy, as the command `load` does, until cancelled.
@@ -132,45 +199,43 @@ class PlanFollower:
     async def _load_newer(self) -> set[str]:
         """Load the newer versions; return what was wrong with others."""
         listing = await self._loader.look()
-        digests, wrong = listing.digests, {error.message for error in listing.wrong}
+        digests, wrong = listing.digests, {error.message for error in listing.errors.values()}
         for name, version in self._newer(digests):
-            key = (name, version, digests[name, version])
+            key = (name, version, digests[name][version])
             if time.monotonic() < self._refused_until.get(key, 0.0):
                 continue
             try:
-                await self.give(Load(version=version), name, by=f"poll {name} {version}")
+                await self.give(Poll(version=version), name)
             except RlservoError as error:
                 wrong.add(error.message)
                 if not isinstance(error, UnavailableError):
                     self._refused_until[key] = time.monotonic() + REFUSED_PERIOD_S
         return wrong
 
-    def _newer(self, digests: Mapping[Key, str]) -> list[Key]:
+    def _newer(self, digests: Mapping[str, Mapping[str, str]]) -> list[Key]:
         """Return the versions that a policy's known ones are all older than; of an unknown policy only the newest."""
         policies = {} if self.plan is None else self.plan.policies
         newer: list[Key] = []
-        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
+        for name, versions in sorted(digests.items()):
             listed, known = self._config.policies.get(name), policies.get(name)
             if self._config.unlisted == "ignore" if listed is None else listed.versions is not None:
                 continue
-            if known is None and newer and newer[-1][0] == name:
-                newer.pop()
-            before = () if known is None else (*known.versions, *known.unloaded)
-            if all(version_key(version) > version_key(each) for each in before):
-                newer.append((name, version))
+            before = [] if known is None else [version_key(each) for each in (*known.versions, *known.unloaded)]
+            later = [(name, version) for version in versions if all(version_key(version) > each for each in before)]
+            newer += later if known is not None else later[-1:]
         return newer
 
     def states(self) -> dict[str, dict[str, VersionState]]:
         """Return the state of every version that is served, should be, or was refused, by name."""
-        states = {key: VersionState("failed", reason) for key, reason in self._refused.items()}
-        states.update({key[:2]: VersionState("failed", error.message) for key, error in self._failed.items()})
+        states = {key: VersionState("loading") for key in self._loader.loading}
+        states |= {key: VersionState("failed", reason) for key, reason in self._refused.items()}
+        states |= {key[:2]: VersionState("failed", error.message) for key, error in self._failed.items()}
         for name, policy in ({} if self.store is None else self.store.plans).items():
-            for version, digest in policy.versions.items():
-                loaded = self._loader.get(name, version, digest)
-                if loaded is not None:
-                    reason = states[name, version].reason if (name, version) in states else ""
-                    states[name, version] = VersionState("ready", reason, timestamp(loaded.loaded_at))
-        states.update({key: VersionState("loading") for key in self._loader.loading if key not in states})
+            for key in policy.loadables(name):
+                if (loaded := self._loader.get(key)) is not None:
+                    reason = states[key[:2]].reason if key[:2] in states else ""
+                    since = loaded.loaded_at.isoformat(timespec="milliseconds")
+                    states[key[:2]] = VersionState("ready", reason, since)
         by_name: dict[str, dict[str, VersionState]] = {}
         for (name, version), state in sorted(states.items(), key=lambda item: (item[0][0], version_key(item[0][1]))):
             by_name.setdefault(name, {})[version] = state
@@ -182,51 +247,37 @@ class PlanFollower:
         Raises BundleError if this process serves nothing yet and a default version cannot be loaded.
         """
         self._tried_at, loading = time.monotonic(), self._loader.loading
-        found: dict[Loadable, Policy | RlservoError] = {}
-        for name, wanted in plan.policies.items():
-            for version, digest in wanted.versions.items():
-                key = (name, version, digest)
-                try:  # a version that is still loading is not waited for again: a file system may hang
-                    hanging = self._failed.get(key) if key[:2] in loading else None
-                    found[key] = hanging or await self._loader.load(*key)
-                except RlservoError as error:
-                    found[key] = error
-        self._arrange(plan, found)
-        await self._loader.touch([digest for _, _, digest in found])
-
-    def _arrange(self, plan: Plan, found: Mapping[Loadable, Policy | RlservoError]) -> None:
-        """Serve the part of a plan that could be loaded. Nothing waits: a request sees the old or the new store."""
+        wanted = [key for name, policy in plan.policies.items() for key in policy.loadables(name)]
+        # A version that is still loading is not waited for again: a file system may hang.
+        hanging = {key: error for key, error in self._failed.items() if key in wanted and key[:2] in loading}
+        found = hanging | await self._loader.load_all(key for key in wanted if key not in hanging)
         if self.plan is not None and plan.generation < self.plan.generation:
             return  # a later plan has been served while this one was loading
+        failed = {key: each for key, each in found.items() if isinstance(each, RlservoError)}
         serving: dict[str, PolicyPlan] = {}
-        kept: dict[Loadable, Policy] = {}
-        for name, wanted in plan.policies.items():
-            keys = [(name, version, digest) for version, digest in wanted.versions.items()]
-            errors = {key[1]: error for key in keys if isinstance(error := found[key], RlservoError)}
+        for name, policy in plan.policies.items():
+            errors = {key[1]: failed[key] for key in policy.loadables(name) if key in failed}
             was = None if self.store is None else self.store.plans.get(name)
             if errors and was is not None:
-                wanted = was
-                keys = [(name, version, digest) for version, digest in was.versions.items()]
-            elif errors and wanted.default in errors:
+                policy = was
+            elif policy.default in errors:
                 if self.store is not None:
                     continue  # not served here rather than as another version; `behind` reports it
                 raise BundleError(
-                    f"policy '{name}' cannot be served as version {wanted.default}, its default in plan "
-                    f"{plan.generation} of {self._files.place}: {errors[wanted.default].message}"
+                    f"policy '{name}' cannot be served as version {policy.default}, its default in plan "
+                    f"{plan.generation} of {self._files.place}: {errors[policy.default].message}"
                 )
-            serving[name] = wanted
-            for key in keys:
-                policy = found.get(key) or self._loader.get(*key)
-                if policy is not None and not isinstance(policy, RlservoError):
-                    kept[key] = policy
+            serving[name] = policy
+        kept: dict[Loadable, Policy] = {}
+        for key in (key for name, policy in serving.items() for key in policy.loadables(name)):
+            loaded = found[key] if key in found else self._loader.get(key)
+            if loaded is not None and not isinstance(loaded, RlservoError):
+                kept[key] = loaded
         self._loader.keep(kept)
-        for policy in kept.values():
-            self._served.setdefault(policy.contract.name, set()).add(policy.identity)
-        changed = [name for name, identities in self._served.items() if len(identities) > 1]
-        self.store = PolicyStore(kept.values(), serving, changed=changed)
+        self.store = PolicyStore(kept.values(), serving, self.store)
         self.plan = plan
-        self._failed = {key: each for key, each in found.items() if isinstance(each, RlservoError)}
-        if self._failed:
+        self._failed = failed
+        if failed:
             logger.error("plan %d cannot be served as it should: %s", plan.generation, "; ".join(self.behind))
         else:
             logger.info("serving plan %d (%s)", plan.generation, plan.changed_by)

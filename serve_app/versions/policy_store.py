@@ -58,15 +58,6 @@ class Decision:
 
 
 @dataclass(frozen=True, slots=True)
-class Shadow:
-    """A version whose actions are computed and compared with the default version's, and not used."""
-
-    of: str  # the default version
-    version: str
-    policy: Policy
-
-
-@dataclass(frozen=True, slots=True)
 class _Served:
     """One policy's loaded versions, and their uses."""
 
@@ -75,29 +66,28 @@ class _Served:
     default: Policy
     canary: Policy | None
     canary_share: float
-    shadow: Shadow | None
+    shadow: Policy | None
 
 
 class PolicyStore:
     """Several policies in several versions, each served by its plan."""
 
     def __init__(
-        self,
-        policies: Iterable[Policy],
-        plans: Mapping[str, PolicyPlan],
-        *,
-        changed: Iterable[str] = (),
+        self, policies: Iterable[Policy], plans: Mapping[str, PolicyPlan], before: PolicyStore | None = None
     ) -> None:
-        """Take loaded policies, and the plan of each by name; `changed` names those that had other versions before.
+        """Take loaded policies, the plan of each by name, and the store that this one follows.
 
         A plan may name versions that are not among the policies; aliases, canary and shadow that point to one are left
         out. Raises UsageError if the default version is missing: no other takes its place.
         """
         self.plans = plans
-        self._changed = frozenset(changed)
+        self._identities: dict[str, frozenset[str]] = {} if before is None else dict(before._identities)
+        """Every identity that was ever served, by name."""
         loaded: dict[str, dict[str, Policy]] = {}
         for policy in sorted(policies, key=lambda each: version_key(each.contract.version)):
-            loaded.setdefault(policy.contract.name, {})[policy.contract.version] = policy
+            name = policy.contract.name
+            loaded.setdefault(name, {})[policy.contract.version] = policy
+            self._identities[name] = self._identities.get(name, frozenset()) | {policy.identity}
         self._served = {name: _serve(name, versions, plans[name]) for name, versions in loaded.items()}
 
     @property
@@ -152,15 +142,7 @@ class PolicyStore:
 
         True if the request names the version itself (an alias may have moved), and if there is and was only one.
         """
-        versions = self._find(name).versions
-        return version in versions or (len(versions) == 1 and name not in self._changed)
-
-    def version_of(self, name: str, reference: str) -> str:
-        """Return the version that a version or an alias means, '' if there is none."""
-        try:
-            return self.get(name, reference).contract.version
-        except UnknownPolicyError:
-            return ""
+        return version in self._find(name).versions or len(self._identities[name]) == 1
 
     def choose(self, name: str, version: str | None, label: str | None) -> Policy:
         """Return the policy for a request: as `get`, but a canary gets its share of the labels.
@@ -180,8 +162,8 @@ class PolicyStore:
         served = self._served.get(name)
         return label is None and served is not None and served.canary is not None
 
-    def shadow(self, name: str) -> Shadow | None:
-        """Return the policy's shadow, if it has one."""
+    def shadow(self, name: str) -> Policy | None:
+        """Return the policy whose actions are compared with the default's, and not used, if there is one."""
         return self._find(name).shadow
 
     def close(self) -> None:
@@ -207,11 +189,8 @@ def _serve(name: str, versions: Mapping[str, Policy], plan: PolicyPlan) -> _Serv
     canary, share = None, 0.0
     if plan.canary is not None:
         canary, share = versions.get(plan.version_of(plan.canary.version) or ""), plan.canary.share
-    shadow: Shadow | None = None
-    if plan.shadow is not None:
-        policy = versions.get(plan.version_of(plan.shadow) or "")
-        if policy is not None and policy is not default:
-            shadow = Shadow(default.contract.version, policy.contract.version, policy.clone())
+    shadow = versions.get(plan.version_of(plan.shadow or "") or "")
+    shadow = None if shadow is None or shadow is default else shadow.clone()
     return _Served(plan, versions, default, canary, share, shadow)
 
 
@@ -247,14 +226,3 @@ def _draw(name: str, label: str | None, canary: Policy) -> float:
         return 1.0 if canary.is_stateful else random.random()
     digest = hashlib.blake2b(f"{name}/{label}".encode("utf-8", "surrogatepass"), digest_size=8).digest()
     return (int.from_bytes(digest, "big") >> 11) * 2.0**-53
-
-
-CARRY = "send 'state' ({} begins an episode, then what the last reply gave)"
-SESSION = (
-    "begin a session ('session_id' with 'reset'; in the Open Inference Protocol 'sequence_id' with 'sequence_start')"
-)
-NEEDS_STATE = f"remembers its episode: {CARRY.replace('an episode', 'one')}, or the inputs 'state_in.*', or {SESSION}"
-NEEDS_LAST = (
-    f"has a limit on the step from one action to the next: {CARRY}, or 'last_action' (in the Open Inference Protocol "
-    f"an input, or 'sequence_start' for the first), or {SESSION}"
-)

@@ -15,10 +15,10 @@ from collections.abc import Mapping
 from datetime import datetime, timezone
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from typing_extensions import Self
 
-from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault, version_key
+from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault
 from rlservo.export.contract.errors import UnknownPolicyError, UsageError
 from rlservo.serve_app.interface import PRODUCTION
 
@@ -33,6 +33,7 @@ def _as_text(value: Any) -> Any:
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 Version = Annotated[str, BeforeValidator(_as_text), Field(pattern=VERSION_PATTERN)]
 Alias = Annotated[str, Field(pattern=ALIAS_PATTERN)]
+Loadable = tuple[str, str, str]  # (name, version, hash of the bundle)
 Reference = Annotated[str, BeforeValidator(_as_text), Field(pattern=f"{VERSION_PATTERN}|{ALIAS_PATTERN}")]
 """A version, or an alias that leads to one: moving the alias also moves this."""
 
@@ -73,11 +74,6 @@ class ServedConfig(_Model):
     unlisted: Literal["load", "ignore"] = "load"
     """Treatment of the repository's policies that `policies` does not name."""
 
-    @property
-    def wants_all(self) -> bool:
-        """Whether it also means bundles that it does not name, so that none of the repository's may be broken."""
-        return self.unlisted == "load" or any(policy.versions is None for policy in self.policies.values())
-
     @classmethod
     def parse(cls, document: Any) -> Self:
         """Check a configuration as it was given. Raises UsageError."""
@@ -91,7 +87,7 @@ class ServedConfig(_Model):
 class PolicyPlan(_Model):
     """One policy of a plan."""
 
-    versions: dict[Version, str]
+    versions: dict[Version, str] = {}
     """Each version's bundle, as the SHA-256 of its SHA256SUMS. Empty if the policy was unloaded: its history is kept
     for when it is loaded again."""
 
@@ -104,13 +100,6 @@ class PolicyPlan(_Model):
 
     canary: Canary | None = None
     shadow: Reference | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        keys = [version_key(version) for version in self.versions]
-        if len(set(keys)) != len(keys):
-            raise ValueError("two versions compare equal, as '1' and '1.0.0' do: keep one of them")
-        return self
 
     @property
     def default(self) -> str | None:
@@ -127,6 +116,10 @@ class PolicyPlan(_Model):
             uses["the shadow"] = self.shadow
         return uses
 
+    def loadables(self, name: str) -> list[Loadable]:
+        """Return the bundles of the versions, given the policy's name."""
+        return [(name, version, digest) for version, digest in self.versions.items()]
+
     def version_of(self, reference: str) -> str | None:
         """Return the version that a version or an alias means, None if there is none."""
         version = self.aliases.get(reference, reference)
@@ -140,8 +133,8 @@ class Plan(_Model):
     """Its number: 1 is a repository's first."""
 
     policies: dict[Name, PolicyPlan]
-    changed_at: str
-    changed_by: str
+    changed_at: str = ""
+    changed_by: str = "configuration"
 
     def policy(self, name: str) -> PolicyPlan:
         """Return a policy. Raises UnknownPolicyError."""
@@ -153,14 +146,5 @@ class Plan(_Model):
 
     def after(self, policies: Mapping[str, PolicyPlan], by: str) -> Plan:
         """Return the next plan, with these policies."""
-        return Plan(generation=self.generation + 1, policies=dict(policies), changed_at=now(), changed_by=by)
-
-
-def now() -> str:
-    """Return the time as plans and statuses write it."""
-    return timestamp(datetime.now(timezone.utc))
-
-
-def timestamp(time: datetime) -> str:
-    """Return a time in UTC as ISO 8601."""
-    return time.isoformat(timespec="milliseconds")
+        now = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+        return Plan(generation=self.generation + 1, policies=dict(policies), changed_at=now, changed_by=by)

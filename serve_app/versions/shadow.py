@@ -10,14 +10,16 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.versions.policy_store import Decision, Shadow
+from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions.policy_store import Decision
 
 logger = logging.getLogger(__name__)
 
@@ -27,33 +29,25 @@ Record = Callable[[str, str, str, Iterable[float]], None]
 """Takes the differences between the actions of a policy's version and its shadow: (policy, version, shadow, ...)."""
 
 
-class _Series:
-    """Differences and counts of one candidate against one default version."""
-
-    def __init__(self) -> None:
-        self.compared = 0
-        self.total = 0.0
-        self.largest = 0.0
-        self.failed = 0
-        self.left_out = 0
-
-
 class Shadows:
     """Compares the candidates' actions with those that were sent."""
 
     def __init__(self, record: Record) -> None:
         self._record = record
-        self._waiting: queue.Queue[tuple[Shadow, Any, Decision]] = queue.Queue(WAITING)
+        self._waiting: queue.Queue[tuple[Policy, Any, Decision]] = queue.Queue(WAITING)
         self._thread: threading.Thread | None = None
-        self._series: dict[tuple[str, str, str], _Series] = {}
+        self.missed: Counter[tuple[tuple[str, str, str], str]] = Counter()
+        """Actions that were not compared, by ((policy, version, shadow), reason)."""
 
-    def offer(self, shadow: Shadow, obs: Any, decision: Decision) -> None:
+    def offer(self, shadow: Policy, obs: Any, decision: Decision) -> None:
         """Queue `obs` for the candidate. Never waits.
 
         A stateful candidate is skipped: it would need a recurrent state of its own for every caller.
         """
-        if shadow.policy.is_stateful:
-            self._series_of(shadow, decision).left_out += 1
+        series = (decision.name, decision.version, shadow.contract.version)
+        self.missed.setdefault((series, "failed"), 0)  # counted in the other thread
+        if shadow.is_stateful:
+            self.missed[series, "left-out"] += 1
             return
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="shadow", daemon=True)
@@ -61,46 +55,20 @@ class Shadows:
         try:
             self._waiting.put_nowait((shadow, obs, decision))
         except queue.Full:
-            self._series_of(shadow, decision).left_out += 1
-
-    def describe(self, policy: str, version: str, shadow: str) -> dict[str, Any]:
-        """Return how the candidate compares so far, on this replica."""
-        series = self._series.get((policy, version, shadow)) or _Series()
-        return {
-            "version": shadow,
-            "compared": series.compared,
-            "mean_difference": series.total / series.compared if series.compared else None,
-            "largest_difference": series.largest if series.compared else None,
-            "failed": series.failed,
-            "left_out": series.left_out,
-        }
-
-    def missed(self) -> Iterator[tuple[str, str, str, str, int]]:
-        """Yield (policy, version, shadow, reason, count) of the actions that were not compared."""
-        for key, series in list(self._series.items()):
-            yield (*key, "failed", series.failed)
-            yield (*key, "left-out", series.left_out)
+            self.missed[series, "left-out"] += 1
 
     def _run(self) -> None:
         while True:
             shadow, obs, decision = self._waiting.get()
-            series = self._series_of(shadow, decision)
+            series = (decision.name, decision.version, shadow.contract.version)
             try:
-                differences = _differences(shadow.policy.act(obs), decision.action, batch=decision.batch)
-            except RlservoError:  # for example its action left the space: a shadow is run to find that
-                series.failed += 1
-                continue
-            except Exception:  # this thread serves every shadow and must survive a broken one
-                logger.exception("shadow %s of policy '%s' failed", shadow.version, decision.name)
-                series.failed += 1
-                continue
-            self._record(decision.name, decision.version, shadow.version, differences.tolist())
-            series.compared += len(differences)
-            series.total += float(differences.sum())
-            series.largest = max(series.largest, float(differences.max(initial=0.0)))
-
-    def _series_of(self, shadow: Shadow, decision: Decision) -> _Series:
-        return self._series.setdefault((decision.name, decision.version, shadow.version), _Series())
+                differences = _differences(shadow.act(obs), decision.action, batch=decision.batch)
+            except Exception as error:  # this thread serves every shadow and must survive a broken one
+                if not isinstance(error, RlservoError):  # as if its action left the space: a shadow is run to find that
+                    logger.exception("shadow %s of policy '%s' failed", shadow.contract.version, decision.name)
+                self.missed[series, "failed"] += 1
+            else:
+                self._record(*series, differences.tolist())
 
 
 def _differences(ours: Any, theirs: Any, *, batch: int | None) -> NDArray[np.float64]:

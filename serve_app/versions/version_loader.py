@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future
-from typing import Any, TypeVar
+from typing import Any
 
 from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import (
-    BundleError,
-    BundleTamperedError,
-    RefusedError,
-    RlservoError,
-    UnavailableError,
-)
-from rlservo.serve_app.repository.remote_repository import Key
-from rlservo.serve_app.repository.repository import Listing, Repository, raise_all
+from rlservo.export.contract.errors import BundleError, RlservoError
+from rlservo.serve_app.repository.repository import Key, Listing, Repository, exchanged, raise_all
 from rlservo.serve_app.repository.storage import TIMEOUT_S
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.serving_plan import PolicyPlan
-
-Loadable = tuple[str, str, str]  # (name, version, hash)
-Result = TypeVar("Result")
+from rlservo.serve_app.versions.serving_plan import Loadable, PolicyPlan
 
 
 class VersionLoader:
@@ -48,80 +37,65 @@ class VersionLoader:
         self._repository = repository
         self._load_bundle = load
         self._options = options or {}
-        self._timeout_s = timeout_s
-        self._calls = BlockingCalls()
+        self._calls = BlockingCalls(timeout_s)
         self._loads: dict[Loadable, Future[Policy]] = {}
         """Loaded versions, and those that are being loaded or could not be."""
 
     @property
     def loading(self) -> set[Key]:
         """Name and version of what is being loaded."""
-        return {(name, version) for (name, version, _), load in self._loads.items() if not load.done()}
+        return {key[:2] for key, load in self._loads.items() if not load.done()}
 
-    def get(self, name: str, version: str, digest: str) -> Policy | None:
+    def get(self, key: Loadable) -> Policy | None:
         """Return the policy if the bundle with that hash is in memory."""
-        load = self._loads.get((name, version, digest))
+        load = self._loads.get(key)
         return None if load is None or not load.done() or load.exception() else load.result()
 
     def keep(self, served: Collection[Loadable]) -> None:
         """Forget the versions in memory that are not served, such as those that were proven for a refused command."""
         self._loads = {key: load for key, load in self._loads.items() if key in served or not load.done()}
+        self._calls.start(self._repository.touch, [digest for _, _, digest in served])
 
     async def look(self) -> Listing:
         """Return what the repository holds now. Raises UnavailableError when that takes too long."""
-        return await self._look(self._repository.look)
+        return await self._calls.run("looking through the policies' folders", self._repository.look)
 
-    async def touch(self, digests: Collection[str]) -> None:
-        """Mark bundles as used in the cache, as `Repository.touch`."""
-        with contextlib.suppress(UnavailableError):
-            await self._look(self._repository.touch, digests)
-
-    async def load(self, name: str, version: str, digest: str) -> Policy:
+    async def load(self, key: Loadable) -> Policy:
         """Load and prove a version unless it is in memory.
 
         Raises what `Repository.fetch` and `Policy.load` raise, and UnavailableError when it takes too long; loading
         continues then, and the next call may find it done.
         """
-        key = (name, version, digest)
         load = self._loads.get(key)  # other callers meanwhile wait for the same one
         if load is None or (load.done() and load.exception()):
             load = self._loads[key] = self._calls.start(self._load_accepted, *key)
-        what = f"loading policy '{name}' version {version}"
-        return await self._calls.wait(load, timeout_s=self._timeout_s, what=what)
+        return await self._calls.wait(f"loading policy '{key[0]}' version {key[1]}", load)
+
+    async def load_all(self, keys: Iterable[Loadable]) -> dict[Loadable, Policy | RlservoError]:
+        """Load versions as `load` does; return each, or why it could not be loaded."""
+        found: dict[Loadable, Policy | RlservoError] = {}
+        for key in keys:
+            try:
+                found[key] = await self.load(key)
+            except RlservoError as error:
+                found[key] = error
+        return found
 
     async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
         """Load new versions of `policies` and those with an alias; check that canary and shadow fit the default one.
 
-        Raises RefusedError with every version that cannot be served, and UnavailableError if it only could not be read,
-        or not in time.
+        Raises BundleError or UsageError with every version that cannot be served, and UnavailableError if they only
+        could not be read, or not in time.
         """
-        failures: list[tuple[Key, RlservoError]] = []
-        for name, policy in policies.items():
-            was = before.get(name)
-            if policy == was:
-                continue
-            relied_on = set(policy.aliases.values())
-            known = {} if was is None else was.versions
-            for version, digest in policy.versions.items():
-                if known.get(version) != digest or version in relied_on:
-                    try:
-                        await self.load(name, version, digest)
-                    except RlservoError as error:
-                        failures.append(((name, version), error))
-            if not failures:
-                await self._check_companions(name, policy)
-        if failures:
-            details = {"versions": [{"name": n, "version": v, "reason": e.message} for (n, v), e in failures]}
-            try:
-                raise_all([error for _, error in failures])
-            except UnavailableError as error:
-                raise UnavailableError(error.message, details) from None
-            except RlservoError as error:
-                raise RefusedError(error.message, details) from None
-
-    async def _look(self, function: Callable[..., Result], *arguments: Any) -> Result:
-        what = "looking through the policies' folders"
-        return await self._calls.run(function, *arguments, timeout_s=self._timeout_s, what=what)
+        changed = {name: policy for name, policy in policies.items() if policy != before.get(name)}
+        wanted = []
+        for name, policy in changed.items():
+            known, relied_on = before[name].versions if name in before else {}, policy.aliases.values()
+            wanted += [(n, v, d) for n, v, d in policy.loadables(name) if known.get(v) != d or v in relied_on]
+        found = await self.load_all(wanted)
+        raise_all({key[:2]: each for key, each in found.items() if isinstance(each, RlservoError)})
+        for name, policy in changed.items():
+            await self._check_companions(name, policy)
 
     def _load_accepted(self, name: str, version: str, digest: str) -> Policy:
         """Load the bundle that was accepted, in a thread."""
@@ -135,10 +109,7 @@ class VersionLoader:
             contract = policy.contract
             # It may have been exchanged since its name was read and its hash accepted.
             if (contract.name, contract.version, policy.digest) != (name, version, digest):
-                raise BundleTamperedError(
-                    f"{folder} is not the bundle that was accepted as version {version} of '{name}': export changes "
-                    "under a new version, or load this one again"
-                )
+                raise exchanged(name, version, folder)
         return policy
 
     async def _check_companions(self, name: str, policy: PolicyPlan) -> None:
@@ -147,22 +118,19 @@ class VersionLoader:
             version = policy.version_of(policy.uses.get(f"the {role}", ""))
             if version is None or policy.default is None:
                 continue
-            both = [await self.load(name, each, policy.versions[each]) for each in (version, policy.default)]
+            both = [await self.load((name, each, policy.versions[each])) for each in (version, policy.default)]
             theirs, ours = (each.contract for each in both)
             if _interface(theirs) != _interface(ours):
-                raise RefusedError(
-                    f"policy '{name}' version {version} cannot be the {role} of version {policy.default}: its "
-                    "observations or actions have other names, types or shapes"
-                )
-            if role == "canary" and theirs.state != ours.state:
-                raise RefusedError(
-                    f"policy '{name}' version {version} cannot be the canary of version {policy.default}: its "
-                    "recurrent state has other names, types or shapes"
-                )
-            if role == "shadow" and theirs.state:
-                raise RefusedError(
-                    f"policy '{name}' version {version} remembers its episode: a shadow computes on single observations"
-                )
+                wrong = "its observations or actions have other names, types or shapes"
+            elif role == "canary" and theirs.state != ours.state:
+                wrong = "its recurrent state has other names, types or shapes"
+            elif role == "shadow" and theirs.state:
+                wrong = "it remembers its episode, and a shadow computes on single observations"
+            else:
+                continue
+            raise BundleError(
+                f"policy '{name}' version {version} cannot be the {role} of version {policy.default}: {wrong}"
+            )
 
 
 def _interface(contract: Contract) -> tuple[Any, ...]:

@@ -131,7 +131,7 @@ def test_a_state_without_a_version_is_only_used_where_it_can_be_of_one_alone(
         assert status == 400 and "does not name its version" in reply["error"], reply
         assert "('@policy' in 'state', or the parameter 'state_policy'), or name the version" in reply["error"]
     assert server.act("leaky/versions/2", state=bare)[1]["version"] == "2"
-    server.store = store_of(versions["2"], changed=["leaky"])  # version 1 was here until a moment ago
+    server.store = store_of(versions["2"], before=server.store)  # version 1 was here until a moment ago
     assert server.act("leaky", state=bare)[0] == 400
 
 

@@ -34,9 +34,9 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UsageError,
 )
+from rlservo.serve_app.repository.index import INDEX, Index
 from rlservo.serve_app.repository.object_storage import ObjectStorage
 from rlservo.serve_app.repository.publication import next_version, publish
-from rlservo.serve_app.repository.remote_repository import INDEX, Index
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.runtime.policy import Policy
@@ -87,7 +87,7 @@ def repository(storage: Storage, cache: Path, **more: Any) -> Repository:
 
 def replica(*places: str, cache: Path, timeout_s: float = 20) -> PlanFollower:
     loader = VersionLoader(Repository(places, cache=cache, timeout_s=timeout_s))
-    return PlanFollower(loader, PlanFiles(places, cache=cache, timeout_s=timeout_s), replica="only")
+    return PlanFollower(loader, PlanFiles(places, cache=cache, timeout_s=timeout_s))
 
 
 def aliased(version: str, alias: str = "production") -> SetAlias:
@@ -382,7 +382,7 @@ def test_a_storage_that_keeps_something_else_than_it_was_given_publishes_nothing
     with pytest.raises(error, match=sentence):
         put(made, storage.uri, "1")
     if "index" not in kind:
-        assert list(repository(storage, cache).look().digests) == [("ur5", "2")]
+        assert list(repository(storage, cache).look().digests["ur5"]) == ["2"]
     storage.tell(None)
     if kept is None:
         put(made, storage.uri, "1")  # the kept part is of the same bundle: it continues from there
@@ -399,7 +399,7 @@ def test_an_index_that_is_none_withdraws_nothing(page: bytes, made: Path, storag
         await control.configure({})
         storage.tell(only(INDEX, lambda *_: (200, {}, page)))
         listing = repository(storage, cache).look()
-        digests, errors = listing.digests, listing.wrong
+        digests, errors = listing.digests, list(listing.errors.values())
         assert digests == {} and "is not an index of versions" in str(errors[0])
         again = replica(storage.uri, cache=cache)
         await again.configure({})
@@ -590,7 +590,7 @@ def test_another_processs_bundle_stays_until_that_ends(made: Path, storage: Stor
     digest = held.look().find("ur5", "1")[1]
     code = (
         "import sys, pathlib; from rlservo.serve_app.repository.bundle_cache import BundleCache\n"
-        f"with BundleCache(pathlib.Path({str(cache)!r}), 1 << 20).bundle({digest!r}, '', None):\n"
+        f"with BundleCache(pathlib.Path({str(cache)!r}), 1 << 20).bundle({digest!r}, None):\n"
         "    print('holds it', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -730,7 +730,7 @@ def test_a_web_server_that_lies_is_told_in_a_sentence(kind: str, made: Path, cac
     with shown(folder, answer) as url:
         began = time.monotonic()
         listing = Repository([url], cache=cache, timeout_s=2).look()
-        digests, errors = listing.digests, listing.wrong
+        digests, errors = listing.digests, list(listing.errors.values())
         assert time.monotonic() - began < 20 and digests == {} and sentence in str(errors[0]), errors
 
 
@@ -847,7 +847,7 @@ def test_a_wait_is_said(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.Mo
     go_on = threading.Event()
 
     async def run() -> None:
-        waiting = asyncio.create_task(BlockingCalls().run(go_on.wait, timeout_s=None, what="loading policy 'ur5'"))
+        waiting = asyncio.create_task(BlockingCalls(60).run("loading policy 'ur5'", go_on.wait))
         await until(lambda: "waiting for loading policy 'ur5'" in caplog.text)
         go_on.set()
         assert await waiting

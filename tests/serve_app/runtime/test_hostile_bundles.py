@@ -79,7 +79,7 @@ def patience(request: pytest.FixtureRequest) -> dict[str, float]:
 def url(root: Path, served: Serve, patience: dict[str, float]) -> Iterator[str]:
     """A server of ur5 in 1 and 2, and of gridworld."""
     loader = VersionLoader(Repository([root]), **patience)
-    control = PlanFollower(loader, plan_files(root), replica="r")
+    control = PlanFollower(loader, plan_files(root))
     asyncio.run(control.configure({}))
     app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
     with served(app) as port:
@@ -299,7 +299,7 @@ def test_a_bundle_that_is_another_one_while_it_is_read_is_not_served_under_the_a
     repository = Repository([root])
     version, digest = repository.look().find("ur5", "2")
     with pytest.raises(BundleTamperedError, match="is not the bundle that was accepted"):
-        asyncio.run(VersionLoader(repository, other).load("ur5", version, digest))
+        asyncio.run(VersionLoader(repository, other).load(("ur5", version, digest)))
 
 
 class Stalled:
@@ -402,7 +402,7 @@ def test_a_process_whose_files_hang_follows_what_others_change_meanwhile(
         controls: list[PlanFollower] = []
         for folder in (root, elsewhere):
             loader = VersionLoader(Repository([folder]), timeout_s=1)
-            controls.append(PlanFollower(loader, plan_files(root), replica=folder.name))
+            controls.append(PlanFollower(loader, plan_files(root)))
         config = {"policies": {"ur5": {"versions": ["1"]}, "gridworld": {}}, "unlisted": "ignore"}
         for control in controls:
             await control.configure(config)
@@ -441,13 +441,13 @@ def test_a_functions_own_time_out_is_not_taken_for_ours() -> None:
         raise TimeoutError("of a network file system")
 
     with pytest.raises(TimeoutError, match="of a network"):
-        asyncio.run(BlockingCalls().run(fail, timeout_s=5, what="test"))
+        asyncio.run(BlockingCalls(5).run("test", fail))
 
 
 def test_threads_are_free_again_for_another_event_loop() -> None:
-    calls = BlockingCalls(limit=1)
+    calls = BlockingCalls(20, limit=1)
     for number in range(50):  # each loop ends as soon as it has its result
-        assert asyncio.run(asyncio.wait_for(calls.run(int, number, timeout_s=None, what="test"), 20)) == number
+        assert asyncio.run(asyncio.wait_for(calls.run("test", int, number), 20)) == number
 
 
 LOAD = """

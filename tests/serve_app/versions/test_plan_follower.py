@@ -27,7 +27,6 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.plan_commands import Load, Rollback, SetAlias, SetCanary, SetShadow, Unload
 from rlservo.serve_app.versions.plan_files import FOLDER, PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.plan_writer import PlanWriter
 from rlservo.serve_app.versions.serving_plan import Plan
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
@@ -42,7 +41,7 @@ class Fleet:
         self.controls = [self.start(folder, f"r{n}") for n, folder in enumerate(folders)]
 
     def start(self, folder: Path, name: str) -> PlanFollower:
-        return PlanFollower(VersionLoader(Repository([folder])), self.files, replica=name)
+        return PlanFollower(VersionLoader(Repository([folder])), self.files)
 
     @property
     def files(self) -> PlanFiles:
@@ -277,7 +276,7 @@ def test_a_process_that_cannot_follow_keeps_what_it_had_and_tells_why(
         await fleet.follow()
         assert fleet.defaults() == ["2", "1"] and fleet.numbers() == {3}
         behind = fleet.controls[1]
-        assert "has no version '2' of policy 'ur5' any more" in behind.behind[0]
+        assert "has no version 2 of policy 'ur5': it has 1, 10" in behind.behind[0]
         assert behind.states()["ur5"]["2"].state == "failed"
         await behind.follow()  # it is not tried again at every look
         shutil.copytree(folder / "ur5" / "2", elsewhere / "ur5" / "2")
@@ -354,7 +353,7 @@ def test_requests_are_answered_while_a_version_loads_and_its_state_says_so(folde
         return Policy.load(bundle)
 
     async def run() -> None:
-        control = PlanFollower(VersionLoader(Repository([folder]), slowly), PlanFiles([folder]), replica="slow")
+        control = PlanFollower(VersionLoader(Repository([folder]), slowly), PlanFiles([folder]))
         await control.configure(config("1", production="1"))
         change = asyncio.create_task(control.give(Load(version="2"), "ur5"))
         while not began.is_set():
@@ -409,17 +408,17 @@ def test_nothing_changes_before_the_policies_are_loaded(folder: Path) -> None:
 
 def test_a_command_without_a_server_begins_the_plan_that_servers_then_serve(folder: Path) -> None:
     async def run() -> None:
-        def writer() -> PlanWriter:
-            return PlanWriter(VersionLoader(Repository([folder])), PlanFiles([folder]))
+        def writer() -> PlanFollower:
+            return PlanFollower(VersionLoader(Repository([folder])), PlanFiles([folder]))
 
-        plan = await writer().give(aliasing("1"), "ur5")
+        plan = await writer().write(aliasing("1"), "ur5")
         assert plan.generation == 1 and plan.policies["ur5"].history == {"production": ("10",)}
         fleet = Fleet(folder, folder)
         await fleet.deploy({})
         assert fleet.defaults() == ["1"]
         break_weights(folder, "2")
         with pytest.raises(RefusedError, match=r"policy\.onnx is not the file"):
-            await writer().give(aliasing("2"), "ur5")
+            await writer().write(aliasing("2"), "ur5")
         await fleet.follow()
         assert fleet.numbers() == {1}
 
