@@ -98,7 +98,6 @@ class PolicyApp:
         """Answer if there is no route, or one that takes the whole body."""
         headers = scope[HEADERS]
         entry = AuditEntry(scope.get("method", ""), path, peer_of(scope), header_text(headers, REQUEST_ID))
-        entry.is_administration = found.access is Access.admin
         own: Headers
         try:
             key = self._check(found, path, scope)
@@ -120,7 +119,8 @@ class PolicyApp:
         except ClientGoneError:
             return
         finally:
-            entry.write()
+            if found.access is Access.admin:
+                entry.write()
 
     def _check(self, found: Found, path: str, scope: Scope) -> Key | None:
         """Return the key that permits a route. Raises what `check_path` and `AccessChecks.check` raise."""

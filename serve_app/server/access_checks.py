@@ -36,7 +36,6 @@ HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+?)\.?(?::[0-9]{1,5})?")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that change nothing
 OWN_SITES = frozenset({b"same-origin", b"none"})  # 'none' is the user, not a page; 'same-site' is another port or name
 ALL_COUNT = frozenset({b"host", b"origin", b"sec-fetch-site", b"content-type", b"content-encoding"})
-UNREADABLE = b"x-rlservo-unreadable"  # names the header that is not UTF-8, of several with one name
 PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
@@ -130,7 +129,7 @@ class StreamKey:
         """Nothing is checked before the first request."""
         self._keys = keys
         self._presented = presented
-        self._changes = -1
+        self._accepted: Keys | None = None  # when it was checked
         self._key: Key | None = None
 
     def check(self) -> bool:
@@ -138,10 +137,10 @@ class StreamKey:
 
         Raises as `authorize` does; RateLimitError concerns only this request.
         """
-        if self._changes != self._keys.changes:
-            changes = self._keys.changes
+        accepted = self._keys.accepted
+        if self._accepted is not accepted:
             self._key = authorize(self._keys, self._presented, Access.act)
-            self._changes = changes
+            self._accepted = accepted
         elif self._key is not None and self._key.limit is not None:
             self._keys.limits.spend(self._key, self._key.limit)
         return self._key is None or self._key.may_explore
@@ -157,8 +156,8 @@ class AccessChecks:
     def check(self, scope: Scope, headers: Mapping[bytes, bytes], access: Access) -> Key | None:
         """Return the key that permits `access`; `headers` are the scope's (`fold_headers`).
 
-        Raises ForbiddenError for another host's request or another origin's page, UnauthenticatedError or
-        ForbiddenError by the key, RequestError for a header that is not UTF-8.
+        Raises ForbiddenError for another host's request or another origin's page, RequestError for two hosts, and what
+        `authorize` raises.
         """
         host = headers.get(b"host")
         if host is not None and b"," in host:
@@ -172,10 +171,7 @@ class AccessChecks:
             scope["type"] == "websocket" or scope["method"] not in READING
         ):
             _check_page(headers.get(b"origin"), headers.get(b"sec-fetch-site"), host)
-        key = authorize(self._keys, presented_key(headers), access)
-        if UNREADABLE in headers or not all(map(bytes.isascii, headers.values())):
-            _check_readable(headers)
-        return key
+        return authorize(self._keys, presented_key(headers), access)
 
 
 def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
@@ -187,8 +183,6 @@ def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     folded = {}
     for name, value in pairs:
         folded[name] = folded[name] + b", " + value if name in folded and name in ALL_COUNT else folded.get(name, value)
-        if not _is_utf8(value):
-            folded[UNREADABLE] = name
     return folded
 
 
@@ -196,14 +190,6 @@ def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
     """Return a header as text, or None if it is absent."""
     value = headers.get(name)
     return None if value is None else value.decode("latin-1")
-
-
-def _is_utf8(value: bytes) -> bool:
-    try:
-        value.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def presented_key(headers: Mapping[bytes, bytes]) -> bytes | None:
@@ -215,15 +201,6 @@ def presented_key(headers: Mapping[bytes, bytes]) -> bytes | None:
             return key.strip()
     value = headers.get(b"x-api-key")
     return None if value is None else value.strip()
-
-
-def _check_readable(headers: Mapping[bytes, bytes]) -> None:
-    """Raise RequestError for a header that is not UTF-8."""
-    unreadable = headers.get(UNREADABLE)
-    if unreadable is None:
-        unreadable = next((name for name, value in headers.items() if not _is_utf8(value)), None)
-    if unreadable is not None:
-        raise RequestError(f"the header '{unreadable[:64].decode('latin-1')}' is not UTF-8")
 
 
 def _check_page(origin: bytes | None, site: bytes | None, host: bytes | None) -> None:
