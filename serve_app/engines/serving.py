@@ -52,7 +52,7 @@ class Serving:
         Raises UsageError, BundleError and UnavailableError.
         """
         await self.control.configure(served)
-        self.handler.admission.loop_clock.start()
+        self.handler.admission.start_clock()
         self._tasks.append(asyncio.create_task(self.control.poll_plan()))
         if self.handler.metrics.is_shared:
             self._tasks.append(asyncio.create_task(keep_sampled(self.handler)))
@@ -66,8 +66,6 @@ class Serving:
         """End the background tasks, close connections and complete the recording."""
         await cancel_all(self._tasks)
         await self.handler.close()
-        if self.handler.recorder is not None:
-            await asyncio.to_thread(self.handler.recorder.close)
 
 
 async def cancel_all(tasks: Sequence[asyncio.Task[None]]) -> None:

@@ -9,6 +9,7 @@ as tasks that the loop has created and not yet run.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import time
@@ -24,6 +25,7 @@ from rlservo.export.contract.errors import (
     RlservoError,
     TooLargeError,
     UnavailableError,
+    UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import ClientGoneError, Episode, Request, check_deadline
@@ -31,7 +33,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
-from rlservo.serve_app.server.content_bounds import count_rows, most_rows
+from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.current_keys import CurrentKeys
 from rlservo.serve_app.server.logs import FIELDS, RequestLog
 from rlservo.serve_app.server.metrics import Metrics
@@ -41,7 +43,6 @@ from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blame
 from rlservo.serve_app.versions.shadow import Shadows
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.episodes.redis_sessions import RedisSessions
     from rlservo.serve_app.server.request_recorder import RequestRecorder
 
 logger = logging.getLogger(__name__)
@@ -94,14 +95,16 @@ class RequestHandler:
         self.replica = replica
         self.keys = CurrentKeys(settings)
         self._store_provider = store_provider
-        self._max_batch = settings.max_batch
         self.settings = settings
         self.admission = Admission(settings)
+        sessions = None
+        if settings.session_store != MEMORY:
+            from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only several workers need it
+
+            patience_s = self.admission.max_wait_s
+            sessions = RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=patience_s)
         self.episodes = Episodes(
-            max_sessions=settings.max_sessions,
-            idle_s=settings.session_idle_s,
-            store=_session_store(settings),
-            is_alone=is_alone,
+            max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, store=sessions, is_alone=is_alone
         )
         self.metrics = Metrics(replica)
         self.log = RequestLog(settings)
@@ -114,9 +117,11 @@ class RequestHandler:
             self.episodes.marks_states = True
 
     async def close(self) -> None:
-        """Close the connections to other services."""
+        """Close the connections to other services, and complete the recording."""
         if self.episodes.store is not None:
             await self.episodes.store.close()
+        if self.recorder is not None:
+            await asyncio.to_thread(self.recorder.close)
 
     def policies(self) -> Iterator[tuple[str, str, Policy]]:
         """Yield (name, version, policy) of every loaded version."""
@@ -185,8 +190,8 @@ class RequestHandler:
         store, name, obs = self.store(), request.policy, request.obs
         if request.deadline_ms is not None and (time.perf_counter() - request.received) * 1e3 >= request.deadline_ms:
             check_deadline(request)  # raises: time has passed since
-        single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
-        if (len(obs) if single else most_rows(obs)) > self._max_batch:
+        is_flat = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
+        if not is_flat or len(obs) > self.settings.max_batch:
             self._check_batch(store, request)
         decision = await self.episodes.act(store, request)
         shadow = store.shadow(name)
@@ -281,9 +286,11 @@ class RequestHandler:
         raise RequestError("the request body holds NaN or Infinity, which JSON does not have: send finite numbers")
 
     def _check_batch(self, store: PolicyStore, request: Request) -> None:
-        rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
-        if rows > self._max_batch:
-            raise TooLargeError(f"a batch of {rows} observations is too large: at most {self._max_batch}")
+        most = self.settings.max_batch
+        with contextlib.suppress(UnknownPolicyError):  # the decision raises it, or that the session has gone with it
+            rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
+            if rows > most:
+                raise TooLargeError(f"a batch of {rows} observations is too large: at most {most}")
 
 
 def _check_names(request: Request) -> None:
@@ -294,12 +301,3 @@ def _check_names(request: Request) -> None:
         if type(text) is str and A_KEY.search(text):
             request.label = request.episode = None
             raise RequestError(f"'{name}' holds an API key, which would be recorded: send another name")
-
-
-def _session_store(settings: ServerSettings) -> RedisSessions | None:
-    """Return the session store that several processes share, if one is set. Raises UsageError."""
-    if settings.session_store == MEMORY:
-        return None
-    from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only servers with several workers need it
-
-    return RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=settings.max_queue_ms / 1e3)
