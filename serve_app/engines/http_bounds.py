@@ -23,10 +23,9 @@ from rlservo.export.contract.errors import DeadlineError, OverloadedError, Reque
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, error_answer, send_reply
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
-LIMITS = "rlservo.limits"  # in the application's lifespan state, which uvicorn hands to each connection
+HANDLER = "rlservo.handler"  # in the application's lifespan state, which uvicorn hands to each connection
 HEAD_S = 5.0  # [s] for a request's head, from the connection's start or the head's first byte
 MAX_HEAD_BYTES = 16384  # of a head, or of trailers
 MAX_PIPELINED = 32  # requests that a connection may send before the first one is answered
@@ -39,21 +38,6 @@ MAX_UNANSWERED = 64  # messages of a WebSocket
 MAX_FRAMES = 1000  # pings, pongs and fragments of a WebSocket per second
 VIOLATION = 1008  # WebSocket's close code for a client that violates the server's rules
 CHECK_S = 1.0  # [s] between two checks of a connection's phase
-
-
-class ConnectionLimits:
-    """Limits that differ from server to server."""
-
-    def __init__(self, settings: ServerSettings, handler: RequestHandler) -> None:
-        self.per_address = settings.max_connections_per_address
-        self.body_s = settings.body_timeout_s
-        self._handler = handler
-
-    def refuse(self, error: RlservoError, client: tuple[str, int] | None) -> tuple[int, bytes]:
-        """Return (status, body) for a request that the application does not get; count and log it."""
-        request = Request("http", "", None, time.perf_counter(), peer=client and client[0])
-        self._handler.record_failure(request, error.code, error.message)
-        return error_answer(error)[:2]
 
 
 class _Refused(Exception):
@@ -79,7 +63,8 @@ class BoundedHttp(HttpToolsProtocol):
         _loop: asyncio.AbstractEventLoop | None = None,
     ) -> None:
         super().__init__(config, server_state, app_state, _loop)
-        self._limits: ConnectionLimits = app_state[LIMITS]
+        self._handler: RequestHandler = app_state[HANDLER]
+        self._per_address = self._handler.settings.max_connections_per_address
         self._since = self.loop.time()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -98,11 +83,11 @@ class BoundedHttp(HttpToolsProtocol):
     def _excess(self) -> int:
         """Return the number of connections by which this address, or the process, exceeds its bound."""
         total = len(self.connections) - MAX_CONNECTIONS
-        if not self._limits.per_address or self.client is None or len(self.connections) <= self._limits.per_address:
+        if not self._per_address or self.client is None or len(self.connections) <= self._per_address:
             return total
         peers: Iterable[Any] = cast("Iterable[Any]", self.connections)
         own = sum(peer.client is not None and peer.client[0] == self.client[0] for peer in peers)
-        return max(int(own) - self._limits.per_address, total)
+        return max(int(own) - self._per_address, total)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop the checks."""
@@ -148,7 +133,7 @@ class BoundedHttp(HttpToolsProtocol):
             self._refuse(f"more than {MAX_PIPELINED} requests were sent before the first one was answered")
         self._in_body = True
         self._trailer_bytes = 0
-        self._await(self._limits.body_s)
+        self._await(self._handler.settings.body_timeout_s)
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
@@ -199,17 +184,23 @@ class BoundedHttp(HttpToolsProtocol):
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.disconnected = True  # a later reply of the application is dropped
             self.cycle.message_event.set()
-        status, content = self._limits.refuse(error, self.client)
+        status, content = self._answer_to(error)
         self.transport.write(
             b"HTTP/1.1 %d \r\ncontent-type: application/json\r\nconnection: close\r\ncontent-length: %d\r\n\r\n%s"
             % (other_status or status, len(content), content)
         )
         self.transport.close()
 
+    def _answer_to(self, error: RlservoError) -> tuple[int, bytes]:
+        """Return (status, body) for a request that the application does not get; count and log it."""
+        request = Request("http", "", None, time.perf_counter(), peer=self.client and self.client[0])
+        self._handler.record_failure(request, error.code, error.message)
+        return error_answer(error)[:2]
+
     def _refuse_connection(self, _scope: Scope, _receive: Receive, send: Send) -> Awaitable[None]:
-        count = self._limits.per_address
+        count = self._per_address
         sentence = f"your address has more than {count} connections, or all clients have {MAX_CONNECTIONS}: close some"
-        _, content = self._limits.refuse(OverloadedError(sentence), self.client)
+        _, content = self._answer_to(OverloadedError(sentence))
         return send_reply(send, 429, content, (*JSON_HEADERS, (b"retry-after", b"1"), (b"connection", b"close")))
 
 

@@ -27,11 +27,10 @@ from uvicorn.supervisors import Multiprocess
 
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.engines.http_bounds import (
-    LIMITS,
+    HANDLER,
     MAX_CONNECTIONS,
     BoundedHttp,
     BoundedWebSocket,
-    ConnectionLimits,
 )
 from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.serving import Serving
@@ -107,6 +106,7 @@ def serve_policies(
     if keys.operator is not None or any(key.role is Role.admin for key in keys.keys):
         admin_key_file = None
     _raise_descriptor_limit()
+    stopping = on_stop or (lambda: None)
     with contextlib.ExitStack() as stack:
         listener = stack.enter_context(contextlib.closing(listen(host, port)))
         if grpc_port is not None:
@@ -125,10 +125,19 @@ def serve_policies(
             if on_ready is not None:
                 on_ready(RunningServer(url, tuple(policies), grpc, admin_key_file if digest else None))
 
-        if workers == 1:
-            _run_here(server, listener, ready, on_stop, stop, in_main)
-        else:
-            _run_workers(server, listener, ready, on_stop)
+        if workers > 1:
+            _run_workers(server, listener, ready, stopping)
+            return
+        server.on_ready = ready
+        running = _Server(server.config(), stopping, stop)
+        configure(chosen)
+        UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
+        if in_main:
+            stack.enter_context(_stop_signals(lambda: setattr(running, "should_exit", True)))
+        try:
+            running.run(sockets=[listener])
+        except SystemExit:
+            raise server.failure or UnavailableError("the server could not start: see its log") from None
 
 
 @dataclass
@@ -144,9 +153,10 @@ class EmbeddedServer:
     workers: int
     settings: ServerSettings
     served: dict[str, Any]
-    failure: RlservoError | None = None
+    on_ready: Callable[[Sequence[tuple[str, str]]], None] | None = None
+    """Called with the policies when they are loaded: connections to the socket, which listens already, are answered."""
+    failure: Exception | None = None
     """Reason why the start failed, in the process that serves."""
-    policies: tuple[tuple[str, str], ...] = ()
     app: ASGIApp | None = None
     """The application, once it has started."""
 
@@ -162,10 +172,10 @@ class EmbeddedServer:
                 await self._start(stack, scope["state"], is_worker=is_worker)
                 await send({"type": "lifespan.startup.complete"})
                 await receive()
-        except RlservoError as error:
+        except (RlservoError, OSError) as error:
             self.failure = error
             if is_worker:
-                logger.error("a worker could not start: %s", error.message)
+                logger.error("a worker could not start: %s", error)
             await send({"type": "lifespan.startup.failed", "message": ""})
             return
         await send({"type": "lifespan.shutdown.complete"})
@@ -183,15 +193,16 @@ class EmbeddedServer:
             raise UsageError(
                 f"the default policy '{settings.default_policy}' is not served: expected {', '.join(store.names)}"
             )
-        self.policies = tuple((name, store.default(name)) for name in store.names)
         if self.grpc_port is not None:
             from rlservo.serve_app.engines.grpc_server import GrpcServer  # takes a quarter of the start
 
             grpc = GrpcServer(serving.handler, self.host, self.grpc_port, is_shared=is_worker)
             await grpc.start()
             stack.push_async_callback(grpc.stop)
-        state[LIMITS] = ConnectionLimits(settings, serving.handler)
+        state[HANDLER] = serving.handler
         self.app = serving.app
+        if self.on_ready is not None:
+            self.on_ready([(name, store.default(name)) for name in store.names])
 
     def config(self) -> uvicorn.Config:
         """Return uvicorn's configuration."""
@@ -233,65 +244,34 @@ def _stop_with_parent() -> None:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server, which reports when it is ready and when it begins to stop, and stops on an event."""
+    """uvicorn's server, which reports when it begins to stop, and stops on an event."""
 
-    def __init__(
-        self,
-        config: uvicorn.Config,
-        on_ready: Callable[[], None],
-        on_stop: Callable[[], None] | None,
-        stop: threading.Event | None,
-    ) -> None:
+    def __init__(self, config: uvicorn.Config, on_stop: Callable[[], None], stop: threading.Event | None) -> None:
         super().__init__(config)
-        self._on_ready, self._on_stop, self._stop = on_ready, on_stop, stop
+        self._on_stop, self._stop = on_stop, stop
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether to stop."""
         return await super().on_tick(counter) or (self._stop is not None and self._stop.is_set())
 
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Load the policies and listen."""
-        await super().startup(sockets)
-        if self.started:
-            self._on_ready()
-
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Answer the requests in progress, and stop."""
-        if self._on_stop is not None:
-            self._on_stop()
+        self._on_stop()
         await super().shutdown(sockets)
-
-
-def _run_here(
-    server: EmbeddedServer,
-    listener: socket.socket,
-    ready: Callable[[Sequence[tuple[str, str]]], None],
-    on_stop: Callable[[], None] | None,
-    stop: threading.Event | None,
-    in_main: bool,
-) -> None:
-    running = _Server(server.config(), lambda: ready(server.policies), on_stop, stop)
-    configure(server.settings)
-    UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
-    with _stop_signals(lambda: setattr(running, "should_exit", True)) if in_main else contextlib.nullcontext():
-        try:
-            running.run(sockets=[listener])
-        except SystemExit:
-            raise server.failure or UnavailableError("the server could not start: see its log") from None
 
 
 def _run_workers(
     server: EmbeddedServer,
     listener: socket.socket,
     ready: Callable[[Sequence[tuple[str, str]]], None],
-    on_stop: Callable[[], None] | None,
+    on_stop: Callable[[], None],
 ) -> None:
     # Faults of the policies are reported here, once, before any worker starts.
     with contextlib.closing(load_served(server.places, ServedConfig.parse(server.served), server.settings)) as store:
-        policies = tuple((name, store.default(name)) for name in store.names)
+        policies = [(name, store.default(name)) for name in store.names]
     UVICORN.setLevel(logging.INFO)
     with _stop_signals(lambda: None), shared_by_workers():  # the first restores the supervisor's signal handlers
-        supervisor = _Supervisor(server.config(), [listener], lambda: ready(policies), on_stop)
+        supervisor = _Supervisor(server.config(), listener, lambda: ready(policies), on_stop)
         supervisor.run()
     if not supervisor.is_asked_to_stop:
         raise UnavailableError("a worker could not start: see the lines above")
@@ -301,13 +281,9 @@ class _Supervisor(Multiprocess):
     """uvicorn's supervisor, which reports when all workers are ready and kills those that do not exit."""
 
     def __init__(
-        self,
-        config: uvicorn.Config,
-        sockets: list[socket.socket],
-        on_ready: Callable[[], None],
-        on_stop: Callable[[], None] | None,
+        self, config: uvicorn.Config, listener: socket.socket, on_ready: Callable[[], None], on_stop: Callable[[], None]
     ) -> None:
-        super().__init__(config, sockets)
+        super().__init__(config, [listener])
         self._on_ready: Callable[[], None] | None = on_ready
         self._on_stop = on_stop
         self.is_asked_to_stop = False
@@ -328,19 +304,14 @@ class _Supervisor(Multiprocess):
             self._on_ready()
             self._on_ready = None
 
-    def handle_int(self) -> None:
-        """Stop on Ctrl-C."""
-        self._stop()
-
     def handle_term(self) -> None:
-        """Stop on SIGTERM."""
-        self._stop()
-
-    def _stop(self) -> None:
-        if not self.is_asked_to_stop and self._on_stop is not None:
+        """Stop on SIGTERM, and on Ctrl-C."""
+        if not self.is_asked_to_stop:
             self._on_stop()
         self.is_asked_to_stop = True
         self.should_exit.set()
+
+    handle_int = handle_term
 
     def join_all(self) -> None:
         """Wait for the workers to exit, and kill those that do not."""
