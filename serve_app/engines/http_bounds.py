@@ -14,10 +14,8 @@ import time
 from collections.abc import Awaitable, Iterable
 from typing import Any, cast
 
-from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from uvicorn.server import ServerState
 
 from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError, RlservoError
 from rlservo.serve_app.episodes.request import Request
@@ -55,21 +53,12 @@ class BoundedHttp(HttpToolsProtocol):
     _trailer_bytes = 0
     _sentence = ""
 
-    def __init__(
-        self,
-        config: Config,
-        server_state: ServerState,
-        app_state: dict[str, Any],
-        _loop: asyncio.AbstractEventLoop | None = None,
-    ) -> None:
-        super().__init__(config, server_state, app_state, _loop)
-        self._handler: RequestHandler = app_state[HANDLER]
-        self._per_address = self._handler.settings.max_connections_per_address
-        self._since = self.loop.time()
-
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Count the connection, and begin to wait for the first head."""
         super().connection_made(transport)
+        self._handler: RequestHandler = self.app_state[HANDLER]
+        self._per_address = self._handler.settings.max_connections_per_address
+        self._since = self.loop.time()
         connection = transport.get_extra_info("socket")
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel closes it if a reply stays unread, also on a WebSocket
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)

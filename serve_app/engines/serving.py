@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.sampled_metrics import keep_sampled
+from rlservo.serve_app.server.metrics import keep_sampled
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import plan_files, version_loader
+from rlservo.serve_app.server.start_check import loader_and_plans
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 
@@ -32,8 +32,7 @@ class Serving:
         `is_alone` says whether every request reaches this process. Nothing is loaded yet. Raises UsageError.
         """
         self.settings = settings
-        loader, files = version_loader(places, settings), plan_files(places, settings)
-        self.control = PlanFollower(loader, files, replica=replica)
+        self.control = PlanFollower(*loader_and_plans(places, settings), replica=replica)
         self.app = create_app(
             lambda: self.control.store,
             settings,
@@ -64,14 +63,7 @@ class Serving:
 
     async def stop(self) -> None:
         """End the background tasks, close connections and complete the recording."""
-        await cancel_all(self._tasks)
-        await self.handler.close()
-
-
-async def cancel_all(tasks: Sequence[asyncio.Task[None]]) -> None:
-    """Cancel tasks until they have ended: `asyncio.wait_for` before Python 3.12 may lose a cancellation."""
-    left = set(tasks)
-    while left:
-        for task in left:
+        for task in self._tasks:  # none waits with `asyncio.wait_for`, which may lose a cancellation before Python 3.12
             task.cancel()
-        _, left = await asyncio.wait(left, timeout=1.0)
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.handler.close()

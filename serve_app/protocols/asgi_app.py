@@ -18,8 +18,8 @@ from rlservo.serve_app.protocols.http_errors import Headers
 from rlservo.serve_app.protocols.routes import GET, Call, Route, RoutingTable
 from rlservo.serve_app.server.access_checks import AccessChecks, Hosts
 from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.request_handler import RequestHandler, StoreProvider
-from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 

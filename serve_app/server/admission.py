@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator
 
 from rlservo.export.contract.errors import LateError, OverloadedError
@@ -35,7 +36,8 @@ class Admission:
         self._burst = 0
         self._burst_began = 0.0
         self.incoming = 0
-        self.streams = 0
+        self.streams: Counter[str] = Counter()
+        """Open streams by policy."""
         self.longest = 0  # the longest burst so far
 
     def start_clock(self) -> None:
@@ -98,12 +100,9 @@ class Admission:
         finally:
             self.incoming -= 1
 
-    def open_stream(self) -> None:
-        """Count an open stream. Raises OverloadedError."""
-        if self.streams >= self._max_streams:
-            raise OverloadedError(f"{self.streams} streams are open in this replica: close one, or try again shortly")
-        self.streams += 1
-
-    def close_stream(self) -> None:
-        """Count one stream less."""
-        self.streams -= 1
+    def open_stream(self, policy: str) -> None:
+        """Count an open stream; its end is `streams[policy] -= 1`. Raises OverloadedError."""
+        count = sum(self.streams.values())
+        if count >= self._max_streams:
+            raise OverloadedError(f"{count} streams are open in this replica: close one, or try again shortly")
+        self.streams[policy] += 1

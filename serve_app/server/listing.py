@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 from rlservo.serve_app.server.request_handler import RequestHandler
@@ -20,21 +21,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
     states = states_of(handler)
     policies = []
     for name in store.names:
-        contract = store.get(name).contract
-        arranged = store.plans[name]
-        shadow = store.shadow(name)
-        versions = []
-        for version, state in states.get(name, {}).items():
-            versions.append(
-                {
-                    "version": version,
-                    "state": state.state,
-                    "reason": state.reason,
-                    "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
-                    "loaded_at": state.loaded_at,
-                    "requests": handler.metrics.requests(name, version),
-                }
-            )
+        contract, arranged, shadow = store.get(name).contract, store.plans[name], store.shadow(name)
         policies.append(
             {
                 "name": name,
@@ -46,7 +33,15 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
                 "previous": {alias: earlier[-1] for alias, earlier in arranged.history.items() if earlier},
                 "canary": arranged.canary and arranged.canary.model_dump(),
                 "shadow": shadow and handler.shadows.describe(name, shadow.of, shadow.version),
-                "version_states": versions,
+                "version_states": [
+                    {
+                        "version": version,
+                        **asdict(state),
+                        "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
+                        "requests": handler.metrics.requests(name, version),
+                    }
+                    for version, state in states.get(name, {}).items()
+                ],
             }
         )
     return {

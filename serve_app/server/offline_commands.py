@@ -10,7 +10,7 @@ from rlservo.export.contract.contract import version_key
 from rlservo.export.contract.errors import RequestError, UsageError
 from rlservo.serve_app.repository.repository import raise_all
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import plan_files, version_loader
+from rlservo.serve_app.server.start_check import loader_and_plans
 from rlservo.serve_app.versions.plan_commands import Changed, parse
 from rlservo.serve_app.versions.plan_writer import PlanWriter
 from rlservo.serve_app.versions.serving_plan import Plan
@@ -21,9 +21,7 @@ class OfflineCommands:
 
     def __init__(self, places: Sequence[str]) -> None:
         """Take the places that `rlservo serve` gets, in the same order. Raises UsageError."""
-        settings = ServerSettings.from_environment()
-        self._files = plan_files(places, settings)
-        self._loader = version_loader(places, settings)
+        self._loader, self._files = loader_and_plans(places, ServerSettings.from_environment())
 
     def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
         """Carry out a command on a policy; return its new listing, as the server would."""
@@ -44,24 +42,20 @@ class OfflineCommands:
     async def _listing(self) -> dict[str, Any]:
         plan = await self._files.call(self._files.newest)
         listing = await self._loader.look()
-        digests, errors = listing.digests, listing.wrong
-        if plan is None and not digests:
-            raise_all(errors)
-        policies = {} if plan is None else plan.policies
-        others: dict[str, list[str]] = {name: [] for name, policy in policies.items() if policy.versions}
-        for name, version in sorted(digests, key=lambda key: (key[0], version_key(key[1]))):
-            if name not in policies or version not in policies[name].versions:
+        if plan is None:
+            if not listing.digests:
+                raise_all(listing.wrong)
+            plan = Plan(generation=0, policies={}, changed_at="", changed_by="")
+        others: dict[str, list[str]] = {name: [] for name, policy in plan.policies.items() if policy.versions}
+        for name, version in sorted(listing.digests, key=lambda key: (key[0], version_key(key[1]))):
+            if name not in plan.policies or version not in plan.policies[name].versions:
                 others.setdefault(name, []).append(version)
+        described = {name: Changed.of(plan, name).model_dump(exclude={"generation", "policy"}) for name in others}
         return {
             "place": self._files.place,
-            "generation": 0 if plan is None else plan.generation,
-            "changed_by": plan and plan.changed_by,
-            "changed_at": plan and plan.changed_at,
-            "policies": [{**_described(plan, name), "not_loaded": others[name]} for name in sorted(others)],
-            "errors": [error.message for error in errors],
+            "generation": plan.generation,
+            "changed_by": plan.changed_by or None,
+            "changed_at": plan.changed_at or None,
+            "policies": [{"name": name, **described[name], "not_loaded": others[name]} for name in sorted(others)],
+            "errors": [error.message for error in listing.wrong],
         }
-
-
-def _described(plan: Plan | None, name: str) -> dict[str, Any]:
-    changed = Changed.of(plan or Plan(generation=0, policies={}, changed_at="", changed_by=""), name)
-    return {"name": name, **changed.model_dump(exclude={"generation", "policy"})}

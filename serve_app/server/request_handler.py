@@ -233,16 +233,14 @@ class RequestHandler:
     def open_stream(self, request: Request) -> None:
         """Count a new stream; `request` is its opening request. Raises OverloadedError."""
         try:
-            self.admission.open_stream()
+            self.admission.open_stream(request.policy)
         except OverloadedError as error:
             self.record_failure(request, error.code, error.message)
             raise
-        self.metrics.count_stream(request.policy, 1)
 
     def close_stream(self, request: Request) -> None:
         """Count one stream less."""
-        self.admission.close_stream()
-        self.metrics.count_stream(request.policy, -1)
+        self.admission.streams[request.policy] -= 1
 
     def _count_end(self, request: Request, decision: Decision, status: str) -> None:
         """Count an episode that ended, unless its requests were divided between versions at random."""

@@ -26,7 +26,7 @@ from rlservo.serve_app.server import current_keys
 from rlservo.serve_app.server.access_checks import find_key
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.current_keys import CurrentKeys
-from rlservo.serve_app.server.sampled_metrics import exposition
+from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from stores import load_store
