@@ -11,8 +11,8 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Awaitable, Iterable
-from typing import Any, cast
+from collections.abc import Awaitable
+from typing import Any
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
@@ -74,9 +74,9 @@ class BoundedHttp(HttpToolsProtocol):
         total = len(self.connections) - MAX_CONNECTIONS
         if not self._per_address or self.client is None or len(self.connections) <= self._per_address:
             return total
-        peers: Iterable[Any] = cast("Iterable[Any]", self.connections)
-        own = sum(peer.client is not None and peer.client[0] == self.client[0] for peer in peers)
-        return max(int(own) - self._per_address, total)
+        peers: Any = self.connections
+        own = sum(1 for peer in peers if peer.client is not None and peer.client[0] == self.client[0])
+        return max(own - self._per_address, total)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop the checks."""
@@ -183,7 +183,7 @@ class BoundedHttp(HttpToolsProtocol):
     def _answer_to(self, error: RlservoError) -> tuple[int, bytes]:
         """Return (status, body) for a request that the application does not get; count and log it."""
         request = Request("http", "", None, time.perf_counter(), peer=self.client and self.client[0])
-        self._handler.record_failure(request, error.code, error.message)
+        self._handler.record_failure(request, error)
         return error_answer(error)[:2]
 
     def _refuse_connection(self, _scope: Scope, _receive: Receive, send: Send) -> Awaitable[None]:

@@ -41,6 +41,7 @@ from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.metrics import FOLDER_VARIABLE, shared_by_workers
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.asgi import ASGIApp, Receive, Scope, Send
@@ -52,7 +53,6 @@ DRAIN_S = 15  # [s] for requests in progress when the server stops
 HUNG_S = 30  # [s] until an unresponsive worker is replaced; a start on a busy machine takes as long
 EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
 DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a server at full load needs
-FEWEST_DESCRIPTORS = 64  # with fewer a server cannot start
 UVICORN = logging.getLogger("uvicorn.error")
 
 
@@ -121,9 +121,10 @@ def serve_policies(
         url = f"http://{shown}:{listener.getsockname()[1]}"
         grpc = None if grpc_port is None else f"{shown}:{grpc_port}"
 
-        def ready(policies: Sequence[tuple[str, str]]) -> None:
+        def ready(store: PolicyStore) -> None:
+            policies = tuple((name, store.default(name)) for name in store.names)
             if on_ready is not None:
-                on_ready(RunningServer(url, tuple(policies), grpc, admin_key_file if digest else None))
+                on_ready(RunningServer(url, policies, grpc, admin_key_file if digest else None))
 
         if workers > 1:
             _run_workers(server, listener, ready, stopping)
@@ -153,8 +154,8 @@ class EmbeddedServer:
     workers: int
     settings: ServerSettings
     served: dict[str, Any]
-    on_ready: Callable[[Sequence[tuple[str, str]]], None] | None = None
-    """Called with the policies when they are loaded: connections to the socket, which listens already, are answered."""
+    on_ready: Callable[[PolicyStore], None] | None = None
+    """Called when the policies are loaded: connections to the socket, which listens already, are answered."""
     failure: Exception | None = None
     """Reason why the start failed, in the process that serves."""
     app: ASGIApp | None = None
@@ -166,22 +167,22 @@ class EmbeddedServer:
 
     async def _live(self, scope: Scope, receive: Receive, send: Send) -> None:
         await receive()
-        is_worker = self.workers > 1
         try:
             async with contextlib.AsyncExitStack() as stack:
-                await self._start(stack, scope["state"], is_worker=is_worker)
+                await self._start(stack, scope["state"])
                 await send({"type": "lifespan.startup.complete"})
                 await receive()
         except (RlservoError, OSError) as error:
             self.failure = error
-            if is_worker:
+            if self.workers > 1:
                 logger.error("a worker could not start: %s", error)
             await send({"type": "lifespan.startup.failed", "message": ""})
             return
         await send({"type": "lifespan.shutdown.complete"})
 
-    async def _start(self, stack: contextlib.AsyncExitStack, state: dict[str, Any], *, is_worker: bool) -> None:
-        settings, replica = self.settings, str(os.getpid()) if is_worker else ""
+    async def _start(self, stack: contextlib.AsyncExitStack, state: dict[str, Any]) -> None:
+        settings, is_worker = self.settings, self.workers > 1
+        replica = str(os.getpid()) if is_worker else ""
         if is_worker:
             configure(settings, replica=replica)
             _stop_with_parent()
@@ -202,7 +203,7 @@ class EmbeddedServer:
         state[HANDLER] = serving.handler
         self.app = serving.app
         if self.on_ready is not None:
-            self.on_ready([(name, store.default(name)) for name in store.names])
+            self.on_ready(store)
 
     def config(self) -> uvicorn.Config:
         """Return uvicorn's configuration."""
@@ -263,15 +264,15 @@ class _Server(uvicorn.Server):
 def _run_workers(
     server: EmbeddedServer,
     listener: socket.socket,
-    ready: Callable[[Sequence[tuple[str, str]]], None],
+    on_ready: Callable[[PolicyStore], None],
     on_stop: Callable[[], None],
 ) -> None:
     # Faults of the policies are reported here, once, before any worker starts.
-    with contextlib.closing(load_served(server.places, ServedConfig.parse(server.served), server.settings)) as store:
-        policies = [(name, store.default(name)) for name in store.names]
+    store = load_served(server.places, ServedConfig.parse(server.served), server.settings)
+    store.close()
     UVICORN.setLevel(logging.INFO)
     with _stop_signals(lambda: None), shared_by_workers():  # the first restores the supervisor's signal handlers
-        supervisor = _Supervisor(server.config(), listener, lambda: ready(policies), on_stop)
+        supervisor = _Supervisor(server.config(), listener, lambda: on_ready(store), on_stop)
         supervisor.run()
     if not supervisor.is_asked_to_stop:
         raise UnavailableError("a worker could not start: see the lines above")
@@ -344,13 +345,11 @@ def _stop_signals(request_stop: Callable[[], None]) -> Iterator[None]:
 
 
 def _raise_descriptor_limit() -> None:
-    """Raise the limit of open files to what a full server needs, as far as possible. Raises UsageError."""
+    """Raise the limit of open files to what a full server needs, as far as possible."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-    if hard != resource.RLIM_INFINITY and hard < FEWEST_DESCRIPTORS:
-        raise UsageError(f"this process may open {hard} files, a server needs {FEWEST_DESCRIPTORS}: raise 'ulimit -n'")
     if hard != resource.RLIM_INFINITY and hard < DESCRIPTORS:
         logger.warning(
             "this process may open %d files: about %d connections at once fit, further ones wait", hard, hard - 64

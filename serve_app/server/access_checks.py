@@ -55,8 +55,8 @@ def check_path(scope: Scope, path: str) -> None:
         )
 
 
-class Hosts:
-    """The names and addresses by which requests may call this server."""
+class OriginChecks:
+    """Refuses HTTP requests and WebSockets for another host, or from a page of another origin."""
 
     def __init__(self, listening_on: str, settings: ServerSettings, *, keyed: bool) -> None:
         """Take the address that the server listens on; `keyed`: whether every action needs an API key."""
@@ -69,6 +69,24 @@ class Hosts:
             self._names |= {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
         self.permit = functools.lru_cache(HOSTS_REMEMBERED)(self._permit)
         """Returns whether a request with this `Host` is for this server."""
+
+    def check(self, scope: Scope, headers: Mapping[bytes, bytes]) -> None:
+        """Raise ForbiddenError for another host's request or another origin's page, RequestError for two hosts.
+
+        `headers` are the scope's (`fold_headers`).
+        """
+        host = headers.get(b"host")
+        if host is not None and b"," in host:
+            raise RequestError("the request has two Host headers: send one")
+        if host is not None and not self.permit(host):
+            raise ForbiddenError(
+                f"the request names the host '{host[:100].decode('latin-1')}': call it by its address, or name it in "
+                "RLSERVO_ALLOWED_HOSTS"
+            )
+        if (b"origin" in headers or b"sec-fetch-site" in headers) and (
+            scope["type"] == "websocket" or scope["method"] not in READING
+        ):
+            _check_page(headers.get(b"origin"), headers.get(b"sec-fetch-site"), host)
 
     def _permit(self, host: bytes) -> bool:
         match = HOST.fullmatch(host.decode("latin-1").lower())
@@ -144,34 +162,6 @@ class StreamKey:
         elif self._key is not None and self._key.limit is not None:
             self._keys.limits.spend(self._key, self._key.limit)
         return self._key is None or self._key.may_explore
-
-
-class AccessChecks:
-    """Refuses HTTP requests and WebSockets by their headers: wrong host, wrong origin, or no key."""
-
-    def __init__(self, hosts: Hosts, keys: CurrentKeys) -> None:
-        self._hosts = hosts
-        self._keys = keys
-
-    def check(self, scope: Scope, headers: Mapping[bytes, bytes], access: Access) -> Key | None:
-        """Return the key that permits `access`; `headers` are the scope's (`fold_headers`).
-
-        Raises ForbiddenError for another host's request or another origin's page, RequestError for two hosts, and what
-        `authorize` raises.
-        """
-        host = headers.get(b"host")
-        if host is not None and b"," in host:
-            raise RequestError("the request has two Host headers: send one")
-        if host is not None and not self._hosts.permit(host):
-            raise ForbiddenError(
-                f"the request names the host '{host[:100].decode('latin-1')}': call it by its address, or name it in "
-                "RLSERVO_ALLOWED_HOSTS"
-            )
-        if (b"origin" in headers or b"sec-fetch-site" in headers) and (
-            scope["type"] == "websocket" or scope["method"] not in READING
-        ):
-            _check_page(headers.get(b"origin"), headers.get(b"sec-fetch-site"), host)
-        return authorize(self._keys, presented_key(headers), access)
 
 
 def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:

@@ -113,7 +113,7 @@ class Metrics(Collector):
         self._difference = histogram("rlservo_shadow_difference", difference, "shadow", DIFFERENCES)
         self.answers: dict[tuple[str, str, str], Answers] = {}  # by policy, version, protocol
         self.failures: Counter[tuple[str, str, str, str]] = Counter()  # by the same and the error's code
-        self.ends: Counter[tuple[str, str, str]] = Counter()  # by policy, version and outcome
+        self.ends: Counter[tuple[str, str, bool]] = Counter()  # by policy, version and success
 
     @property
     def is_shared(self) -> bool:
@@ -143,7 +143,7 @@ class Metrics(Collector):
 
     def count_end(self, decision: Decision, status: str) -> None:
         """Count an episode whose end a client reported. Its status is free text: counted as `success` or as another."""
-        self.ends[decision.name, decision.version, SUCCESS if status == SUCCESS else "other"] += 1
+        self.ends[decision.name, decision.version, status == SUCCESS] += 1
 
     def record_differences(self, policy: str, version: str, shadow: str, differences: Iterable[float]) -> None:
         """Record by how much a shadow's actions differ from those of the version that answered."""
@@ -266,8 +266,8 @@ def requests(handler: RequestHandler) -> None:
         show.counter("rlservo_requests", "Requests by outcome", count, **which)
     for policy, count in handler.admission.streams.items():
         show.gauge("rlservo_streams", "Open WebSockets", count, policy=policy)
-    for (policy, version, outcome), count in show.ends.items():
-        which = {"policy": policy, "version": version, "outcome": outcome}
+    for (policy, version, succeeded), count in show.ends.items():
+        which = {"policy": policy, "version": version, "outcome": SUCCESS if succeeded else "other"}
         show.counter("rlservo_episode_ends", "Episodes whose end a client reported (`final_status`)", count, **which)
 
 

@@ -164,8 +164,7 @@ class RequestHandler:
         except ClientGoneError:
             raise
         except RlservoError as error:
-            asked, counted_as = blamed_version(error), self._counted_as(request, error)
-            self.record_failure(request, error.code, error.message, asked=asked, counted_as=counted_as)
+            self.record_failure(request, error)
             if self.recorder is not None:
                 self.recorder.note_failure(request, self._store_provider(), error)
             raise
@@ -199,29 +198,24 @@ class RequestHandler:
             self.shadows.offer(shadow, obs, decision)
         return decision
 
-    def record_failure(
-        self,
-        request: Request,
-        code: str,
-        sentence: str,
-        *,
-        asked: str | None = None,
-        counted_as: str | None = None,
-    ) -> None:
-        """Count and log a request that got no action; requests for unknown names share one count.
+    def record_failure(self, request: Request, error: RlservoError, code: str = "") -> None:
+        """Count and log a request that got no action, under the error's code or another one.
 
-        `asked` is the version that failed, if one was asked; `counted_as` is the code in the metrics, if it differs.
+        Requests for unknown names share one count.
         """
-        name, version = request.policy, request.version
-        store = self._store_provider()
+        name, version, asked = request.policy, request.version, blamed_version(error)
+        store, code = self._store_provider(), code or error.code
+        counted_as = code
         if store is None or name not in store.names:
             name = version = ""
         elif asked is not None:
             version = asked
+            if isinstance(error, ObservationError) and _is_stricter(store, request, asked):
+                counted_as = STRICTER
         else:  # an alias counts as its version, no version as the default
             version = store.default(name) if version is None else store.version_of(name, version)
-        self.metrics.count_failure(request.protocol, name, version, counted_as or code)
-        self.log.write_failure(request, code, sentence)
+        self.metrics.count_failure(request.protocol, name, version, counted_as)
+        self.log.write_failure(request, code, error.message)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
         """Count a request that failed with the current exception, and log its traceback."""
@@ -235,7 +229,7 @@ class RequestHandler:
         try:
             self.admission.open_stream(request.policy)
         except OverloadedError as error:
-            self.record_failure(request, error.code, error.message)
+            self.record_failure(request, error)
             raise
 
     def close_stream(self, request: Request) -> None:
@@ -258,22 +252,6 @@ class RequestHandler:
         # Only now that the body is here: a client that sends slowly delays only itself.
         request.received = min(request.received, self.admission.enter())
 
-    def _counted_as(self, request: Request, error: RlservoError) -> str:
-        """Return the code to count for a failure: its own, or STRICTER if the version that was asked is at fault.
-
-        Most observations that a version refuses would be refused by every version, and say nothing about it. One that
-        production accepts does, even if the version's contract demands the refusal.
-        """
-        version, store = blamed_version(error), self._store_provider()
-        if version is None or store is None or not isinstance(error, ObservationError):
-            return error.code
-        with contextlib.suppress(RlservoError):
-            production = store.get(request.policy)
-            if production.contract.version != version:
-                production.parse(request.obs)
-                return STRICTER
-        return error.code
-
     async def _decide_non_finite(self, request: Request) -> Decision:
         """Refuse numbers that JSON lacks, naming the element if it is one of the observation's."""
         if request.episode is None:  # otherwise a session would advance
@@ -289,6 +267,19 @@ class RequestHandler:
             rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
             if rows > most:
                 raise TooLargeError(f"a batch of {rows} observations is too large: at most {most}")
+
+
+def _is_stricter(store: PolicyStore, request: Request, version: str) -> bool:
+    """Return whether production accepts an observation that a version has refused.
+
+    Most that a version refuses would be refused by every version, and say nothing about it. One that production accepts
+    does, even if the version's contract demands the refusal.
+    """
+    production = store.get(request.policy)
+    try:
+        return production.contract.version != version and bool(production.parse(request.obs))
+    except RlservoError:
+        return False
 
 
 def _check_names(request: Request) -> None:

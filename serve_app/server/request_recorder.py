@@ -147,7 +147,7 @@ class RequestRecorder:
             arrays = known.observations.arrays(request.obs)
         except Exception:  # it may be anything: it has not been checked yet
             return
-        episode = "" if _carries_state(request) else _episode_of(request)
+        episode = _episode_of(request) if said.state is None else ""
         step = self._count(policy.contract.name, episode, said.reset) if episode else 0
         record = DecisionRecord(
             known, LeafArrays({name: array.copy() for name, array in arrays.items()}), None, episode, step, taken_ms,
@@ -190,13 +190,9 @@ class RequestRecorder:
 
 def _episode_of(request: Request) -> str:
     """Return a request's episode: its session, its stream, or everything under its label."""
-    return _session_of(request) or request.stream_id or shorten_label(request.label or "")
-
-
-def _session_of(request: Request) -> str | None:
-    if request.episode is None or request.episode.session_id is None:
-        return None
-    session_id = request.episode.session_id
+    session_id = None if request.episode is None else request.episode.session_id
+    if session_id is None:
+        return request.stream_id or shorten_label(request.label or "")
     return session_id if isinstance(session_id, str) else f"#{session_id}"  # 7 and "7" are different sessions
 
 
@@ -211,7 +207,3 @@ def _numbers(reward: Any, rows: int) -> NDArray[np.float64] | None:
     except RequestError:
         return None
     return numbers if len(numbers) in (1, rows) and np.isfinite(numbers).all() else None
-
-
-def _carries_state(request: Request) -> bool:
-    return request.episode is not None and request.episode.state is not None

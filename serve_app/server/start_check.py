@@ -26,7 +26,7 @@ def load_served(
 
     Raises UsageError or BundleError, and UnavailableError if a file system or storage does not answer.
     """
-    control = PlanFollower(*loader_and_plans(paths, settings or ServerSettings()))
+    control = PlanFollower(*loader_and_plans(paths, settings or ServerSettings.from_environment(environment={})))
     asyncio.run(control.configure(config.model_dump(exclude_unset=True)))
     if control.store is None:
         raise UnavailableError("no policies were loaded")

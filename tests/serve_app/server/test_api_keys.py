@@ -17,9 +17,8 @@ from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.access_checks import AccessChecks, Hosts, find_key, fold_headers
-from rlservo.serve_app.server.api_keys import Access, Keys, Role, check_exposure, new_key
-from rlservo.serve_app.server.current_keys import CurrentKeys
+from rlservo.serve_app.server.access_checks import OriginChecks, find_key, fold_headers
+from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.policy_store import PolicyStore
@@ -202,9 +201,8 @@ def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served
 
 def check(headers: list[tuple[bytes, bytes]], **settings: Any) -> None:
     """Check a request with these headers against a server on loopback that wants no key."""
-    chosen = ServerSettings(**settings)
-    checks = AccessChecks(Hosts("127.0.0.1", chosen, keyed=False), CurrentKeys(chosen))
-    checks.check({"type": "http", "method": "POST"}, fold_headers(headers), Access.act)
+    checks = OriginChecks("127.0.0.1", ServerSettings(**settings), keyed=False)
+    checks.check({"type": "http", "method": "POST"}, fold_headers(headers))
 
 
 @pytest.mark.parametrize(
@@ -234,7 +232,7 @@ def test_a_request_that_names_two_hosts_is_refused(hosts: tuple[bytes, bytes], a
 
 
 def asked_as(host: str, listening_on: str, *, keyed: bool = False, allowed: str = "") -> bool:
-    return Hosts(listening_on, ServerSettings(allowed_hosts=allowed), keyed=keyed).permit(host.encode())
+    return OriginChecks(listening_on, ServerSettings(allowed_hosts=allowed), keyed=keyed).permit(host.encode())
 
 
 def test_a_server_answers_to_its_own_names_and_addresses() -> None:
