@@ -48,8 +48,11 @@ class GrpcServer:
         service: Any = health  # its asyncio part is not in its type stubs
         self._health = service.aio.HealthServicer()  # probed by orchestrators, without a key
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        if settings.grpc_reflection:
-            _add_reflection(self._server)
+        if settings.grpc_reflection:  # grpcurl and others ask which methods and messages the protocol has
+            from grpc_reflection.v1alpha import reflection
+
+            pool = messages.ModelInferRequest.DESCRIPTOR.file.pool
+            reflection.enable_server_reflection((SERVICE, reflection.SERVICE_NAME), self._server, pool=pool)
 
     async def start(self) -> None:
         """Listen, and report the health status "serving". Raises UnavailableError if it cannot listen on the port."""
@@ -70,11 +73,3 @@ class GrpcServer:
         remaining = context.time_remaining()
         deadline = None if remaining is None or remaining > LONGEST_S else remaining
         return await self._grpc.answer(name, (content, deadline), context)
-
-
-def _add_reflection(server: Any) -> None:
-    """Let grpcurl and others ask which methods and messages the protocol has."""
-    from grpc_reflection.v1alpha import reflection
-
-    pool = messages.ModelInferRequest.DESCRIPTOR.file.pool
-    reflection.enable_server_reflection((SERVICE, reflection.SERVICE_NAME), server, pool=pool)

@@ -45,7 +45,6 @@ class _Refused(Exception):
 class BoundedHttp(HttpToolsProtocol):
     """A connection that ends when a client sends too much or takes too long."""
 
-    _check_timer: asyncio.TimerHandle | None = None
     _phase_limit_s: float | None = HEAD_S  # [s] None while nothing is awaited from the client
     _is_late = False  # whether the phase was beyond its limit at the last check
     _in_body = False
@@ -62,7 +61,7 @@ class BoundedHttp(HttpToolsProtocol):
         connection = transport.get_extra_info("socket")
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel closes it if a reply stays unread, also on a WebSocket
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
-        self._check_timer = self.loop.call_later(CHECK_S, self._check)
+        self.loop.call_later(CHECK_S, self._check)
         excess = self._excess()
         if excess >= SPARE:
             transport.abort()
@@ -77,16 +76,6 @@ class BoundedHttp(HttpToolsProtocol):
         peers: Any = self.connections
         own = sum(1 for peer in peers if peer.client is not None and peer.client[0] == self.client[0])
         return max(own - self._per_address, total)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the checks."""
-        self._stop_checks()
-        super().connection_lost(exc)
-
-    def handle_websocket_upgrade(self) -> None:
-        """Hand the connection over to the WebSocket, which has its own bounds."""
-        self._stop_checks()
-        super().handle_websocket_upgrade()
 
     def data_received(self, data: bytes) -> None:
         """Read the data; of a head, no more than is allowed."""
@@ -141,7 +130,9 @@ class BoundedHttp(HttpToolsProtocol):
         self._phase_limit_s, self._since, self._is_late = limit_s, self.loop.time(), False
 
     def _check(self) -> None:
-        self._check_timer = self.loop.call_later(CHECK_S, self._check)
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:  # a WebSocket has its own bounds
+            return
+        self.loop.call_later(CHECK_S, self._check)
         if self._phase_limit_s is None or self.loop.time() - self._since <= self._phase_limit_s:
             return
         if not self._is_late:  # a starved process may still have to read data that came in time
@@ -150,11 +141,6 @@ class BoundedHttp(HttpToolsProtocol):
             self.transport.abort()  # it was answered, and the rest of its body never came
         else:
             self._end(DeadlineError(f"the request did not arrive within {self._phase_limit_s:g} s"))
-
-    def _stop_checks(self) -> None:
-        if self._check_timer is not None:
-            self._check_timer.cancel()
-            self._check_timer = None
 
     def _check_upgrade(self, method: bytes) -> None:
         """Refuse any Upgrade except a WebSocket's without a body, since uvicorn would drop the body."""

@@ -117,7 +117,6 @@ class PolicyServer(InferenceMethods):
         """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
         self._settings = ServerSettings(**settings)
         self._load = Load()
-        self._is_started = False
         replica = serve.get_replica_context().replica_tag
         host = _listening_host()
         try:
@@ -144,14 +143,13 @@ class PolicyServer(InferenceMethods):
 
         Serve sends a replica no requests while this runs, so only the first call waits until everything is loaded.
         """
-        if self._is_started:
+        if self._serving.control.store is not None:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
             return
         try:
             await self._serving.start(user_config)
         except RlservoError as error:
             raise _plain(error) from None
-        self._is_started = True
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Report this replica's load to Serve's autoscaler, for `autoscaling.by_load`."""
@@ -160,7 +158,7 @@ class PolicyServer(InferenceMethods):
     async def check_health(self) -> None:
         """Report that the event loop runs and the policies are loaded; otherwise Serve replaces this replica."""
         await asyncio.sleep(0)
-        if not self._is_started:
+        if self._serving.control.store is None:
             raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, not null")
 
     async def __del__(self) -> None:

@@ -11,8 +11,6 @@ Sources: Fetch Standard, section 3.1 (Origin); W3C Fetch Metadata Request Header
 from __future__ import annotations
 
 import functools
-import hashlib
-import hmac
 import ipaddress
 import re
 import socket
@@ -20,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
-from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Keys, Role
+from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Role
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
@@ -120,7 +118,7 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     if presented is None:
         what = "administration needs an admin" if admin else "this server requires an API"
         raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
-    key = find_key(accepted, presented)
+    key = accepted.find(presented)
     if key is None:
         raise UnauthenticatedError("the server does not know this API key")
     if key.limit is not None:
@@ -130,38 +128,21 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     return key
 
 
-def find_key(keys: Keys, presented: bytes) -> Key | None:
-    """Return the key that was presented. It is compared with every stored digest, each in constant time."""
-    digest = hashlib.sha256(presented).digest()
-    found = None
-    for key in keys.keys if keys.operator is None else (*keys.keys, keys.operator):
-        if hmac.compare_digest(digest, key.digest):
-            found = key
-    return found
-
-
 class StreamKey:
-    """The key of an open stream: checked again after every change of the keys, and counted with every request."""
+    """The key of an open stream, checked and counted with every request: it may have been removed since."""
 
     def __init__(self, keys: CurrentKeys, presented: bytes | None) -> None:
         """Nothing is checked before the first request."""
         self._keys = keys
         self._presented = presented
-        self._accepted: Keys | None = None  # when it was checked
-        self._key: Key | None = None
 
     def check(self) -> bool:
-        """Return whether the key may ask for exploring actions, after checking it for one more request.
+        """Return whether the key may ask for exploring actions.
 
         Raises as `authorize` does; RateLimitError concerns only this request.
         """
-        accepted = self._keys.accepted
-        if self._accepted is not accepted:
-            self._key = authorize(self._keys, self._presented, Access.act)
-            self._accepted = accepted
-        elif self._key is not None and self._key.limit is not None:
-            self._keys.limits.spend(self._key, self._key.limit)
-        return self._key is None or self._key.may_explore
+        key = authorize(self._keys, self._presented, Access.act)
+        return key is None or key.may_explore
 
 
 def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:

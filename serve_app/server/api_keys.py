@@ -18,6 +18,7 @@ import secrets
 import stat
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
 
 from typing_extensions import Self
@@ -94,6 +95,14 @@ class Keys:
     keys: tuple[Key, ...] = ()
     operator: Key | None = None
     """For administration; a server with only this key requires none for actions."""
+
+    @cached_property
+    def _by_digest(self) -> dict[bytes, Key]:
+        return {key.digest: key for key in (*self.keys, *filter(None, [self.operator]))}
+
+    def find(self, presented: bytes) -> Key | None:
+        """Return the key that was presented. The time of a look-up by its SHA-256 helps no one to guess it."""
+        return self._by_digest.get(hashlib.sha256(presented).digest())
 
     @classmethod
     def from_settings(cls, settings: ServerSettings, *, file_content: bytes | None = None) -> Self:

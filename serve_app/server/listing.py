@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 from rlservo.serve_app.server.request_handler import RequestHandler
@@ -36,7 +35,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
                 "version_states": [
                     {
                         "version": version,
-                        **asdict(state),
+                        **vars(state),
                         "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
                         "requests": handler.metrics.requests(name, version),
                     }

@@ -252,13 +252,13 @@ async def keep_sampled(handler: RequestHandler) -> None:
 
 def sample(handler: RequestHandler) -> None:
     """Bring all counters and gauges up to date."""
-    for part in (requests, versions, queue, keys, recording, sessions, shadows):
+    for part in (requests, versions, process, sessions):
         part(handler)
     handler.metrics.end_round()
 
 
 def requests(handler: RequestHandler) -> None:
-    """Sample the counts of requests, streams and episodes."""
+    """Sample the counts of requests, streams, episodes and shadows."""
     show = handler.metrics
     outcomes = {(*key, "ok"): answers.count for key, answers in show.answers.items()} | show.failures
     for (policy, version, protocol, code), count in outcomes.items():
@@ -269,6 +269,9 @@ def requests(handler: RequestHandler) -> None:
     for (policy, version, succeeded), count in show.ends.items():
         which = {"policy": policy, "version": version, "outcome": SUCCESS if succeeded else "other"}
         show.counter("rlservo_episode_ends", "Episodes whose end a client reported (`final_status`)", count, **which)
+    for policy, version, shadow, reason, count in handler.shadows.missed():
+        which = {"policy": policy, "version": version, "shadow": shadow, "reason": reason}
+        show.counter("rlservo_shadow_missed", "Actions not compared with a shadow's", count, **which)
 
 
 def versions(handler: RequestHandler) -> None:
@@ -293,32 +296,22 @@ def versions(handler: RequestHandler) -> None:
             show.gauge("rlservo_observation_spread", spread, deviation, **which, element=element)
 
 
-def queue(handler: RequestHandler) -> None:
-    """Sample the requests that wait for this process."""
-    admission, show = handler.admission, handler.metrics
+def process(handler: RequestHandler) -> None:
+    """Sample this process's queue, API keys and recording."""
+    admission, keys, show = handler.admission, handler.keys, handler.metrics
     waited = "Largest number of requests that waited for the processor at once, since the start"
     show.gauge("rlservo_queue_longest", waited, admission.longest)
     show.gauge("rlservo_requests_incoming", "Requests whose body is still arriving", admission.incoming)
-
-
-def keys(handler: RequestHandler) -> None:
-    """Sample whether the API keys in use are those of their file, and the refusals by rate limit."""
-    show = handler.metrics
     current = "1 while the API keys in use are those of their file; 0 if older keys stay in use"
-    show.gauge("rlservo_api_keys_current", current, handler.keys.current)
-    for label, count in handler.keys.limits.refused.items():
+    show.gauge("rlservo_api_keys_current", current, keys.current)
+    for label, count in keys.limits.refused.items():
         show.counter("rlservo_rate_limited", "Requests refused because their key exceeded its rate", count, key=label)
-
-
-def recording(handler: RequestHandler) -> None:
-    """Sample the recorded and missing decisions, if recording is on."""
-    if handler.recorder is None:
-        return
-    recorder, show = handler.recorder.recorder, handler.metrics
-    goes_on = "1 while decisions are recorded; 0 if the folder cannot be written"
-    show.gauge("rlservo_recording", goes_on, recorder.failure is None)
-    show.counter("rlservo_records_written", "Decisions and outcomes in the recording", recorder.written)
-    show.counter("rlservo_records_dropped", "Decisions dropped by a full recording buffer", recorder.dropped)
+    if handler.recorder is not None:
+        recorder = handler.recorder.recorder
+        goes_on = "1 while decisions are recorded; 0 if the folder cannot be written"
+        show.gauge("rlservo_recording", goes_on, recorder.failure is None)
+        show.counter("rlservo_records_written", "Decisions and outcomes in the recording", recorder.written)
+        show.counter("rlservo_records_dropped", "Decisions dropped by a full recording buffer", recorder.dropped)
 
 
 def sessions(handler: RequestHandler) -> None:
@@ -334,10 +327,3 @@ def sessions(handler: RequestHandler) -> None:
         failed = "Failed reads and writes of sessions in Redis; the requests were answered with 503"
         show.counter("rlservo_session_store_failures", failed, episodes.store.unreachable)
     show.gauge("rlservo_episodes_remembered", "Episodes in memory, in sessions and on streams", kept.rows)
-
-
-def shadows(handler: RequestHandler) -> None:
-    """Sample the actions without a shadow's comparison."""
-    for policy, version, shadow, reason, count in handler.shadows.missed():
-        which = {"policy": policy, "version": version, "shadow": shadow, "reason": reason}
-        handler.metrics.counter("rlservo_shadow_missed", "Actions not compared with a shadow's", count, **which)

@@ -17,7 +17,7 @@ from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.access_checks import OriginChecks, find_key, fold_headers
+from rlservo.serve_app.server.access_checks import OriginChecks, fold_headers
 from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
@@ -79,8 +79,8 @@ def test_a_key_is_never_kept_only_its_hash() -> None:
     assert len(CELL) > 40 and CELL != OTHER
     keys = Keys.from_settings(ServerSettings(api_keys=f"{CELL_LINE}, {ADMIN_LINE},"))
     assert [(key.label, key.role) for key in keys.keys] == [("cell-7", Role.act), ("operator", Role.admin)]
-    assert find_key(keys, ADMIN.encode()) == keys.keys[1]
-    assert find_key(keys, b"") is find_key(keys, CELL[:-1].encode()) is find_key(keys, CELL_LINE.encode()) is None
+    assert keys.find(ADMIN.encode()) == keys.keys[1]
+    assert keys.find(b"") is keys.find(CELL[:-1].encode()) is keys.find(CELL_LINE.encode()) is None
     assert CELL_LINE not in repr(ServerSettings(api_keys=CELL_LINE))
 
 
