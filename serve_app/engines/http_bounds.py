@@ -56,7 +56,6 @@ class BoundedHttp(HttpToolsProtocol):
         """Count the connection, and begin to wait for the first head."""
         super().connection_made(transport)
         self._handler: RequestHandler = self.app_state[HANDLER]
-        self._per_address = self._handler.settings.max_connections_per_address
         self._since = self.loop.time()
         connection = transport.get_extra_info("socket")
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel closes it if a reply stays unread, also on a WebSocket
@@ -70,12 +69,12 @@ class BoundedHttp(HttpToolsProtocol):
 
     def _excess(self) -> int:
         """Return the number of connections by which this address, or the process, exceeds its bound."""
-        total = len(self.connections) - MAX_CONNECTIONS
-        if not self._per_address or self.client is None or len(self.connections) <= self._per_address:
-            return total
-        peers: Any = self.connections
-        own = sum(1 for peer in peers if peer.client is not None and peer.client[0] == self.client[0])
-        return max(own - self._per_address, total)
+        total, most = len(self.connections), self._handler.settings.max_connections_per_address
+        own = 0
+        if most and self.client is not None and total > most:
+            peers: Any = self.connections
+            own = sum(1 for peer in peers if peer.client is not None and peer.client[0] == self.client[0])
+        return max(own - most, total - MAX_CONNECTIONS)
 
     def data_received(self, data: bytes) -> None:
         """Read the data; of a head, no more than is allowed."""
@@ -173,7 +172,7 @@ class BoundedHttp(HttpToolsProtocol):
         return error_answer(error)[:2]
 
     def _refuse_connection(self, _scope: Scope, _receive: Receive, send: Send) -> Awaitable[None]:
-        count = self._per_address
+        count = self._handler.settings.max_connections_per_address
         sentence = f"your address has more than {count} connections, or all clients have {MAX_CONNECTIONS}: close some"
         _, content = self._answer_to(OverloadedError(sentence))
         return send_reply(send, 429, content, (*JSON_HEADERS, (b"retry-after", b"1"), (b"connection", b"close")))
