@@ -68,11 +68,6 @@ class RateLimit:
     rate: float  # requests a second
     burst: int  # requests at once, after a pause
 
-    @classmethod
-    def parse(cls, rate: str | None, burst: str | None) -> RateLimit | None:
-        """Return a line's limit; the default burst is one second's requests."""
-        return None if rate is None else cls(float(rate), int(burst) if burst else math.ceil(float(rate)))
-
 
 @dataclass(frozen=True)
 class Key:
@@ -121,7 +116,9 @@ class Keys:
                     f"{where}: expected '<label> <act|explore|admin> sha256:<64 hexadecimal digits>', as 'rlservo key "
                     "LABEL' makes it, optionally followed by 'rate=<requests a second> burst=<requests>', each above 0"
                 )
-            limit = RateLimit.parse(match["rate"], match["burst"])
+            limit = None
+            if match["rate"] is not None:  # without a burst, one second's requests may come at once
+                limit = RateLimit(float(match["rate"]), int(match["burst"] or math.ceil(float(match["rate"]))))
             keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"]), limit))
         if (settings.api_keys_file is not None or settings.api_keys.strip()) and not keys:
             raise UsageError(
