@@ -25,7 +25,7 @@ from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.http_errors import status_of
 from rlservo.serve_app.runtime.options import PolicyOptions
-from rlservo.serve_app.server import metrics, sampled_metrics
+from rlservo.serve_app.server import metrics
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 from rlservo.serve_app.versions.plan_commands import COMMANDS
 
@@ -218,7 +218,7 @@ def metric_list() -> str:
             "replica. Drift (`observation_...`) is measured from one request in 16, for policies with `MeanStdFilter`."
         )
     )
-    found = sorted(one for module in (metrics, sampled_metrics) for one in metric_calls(module))
+    found = sorted(metric_calls(metrics))
     text.append("\n".join(bullet(name, ", ".join([kind, *labels]), text) for name, kind, text, labels in found))
     return "\n\n".join(text) + "\n"
 

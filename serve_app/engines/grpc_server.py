@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Callable
+from functools import partial
+from operator import methodcaller
 from typing import Any
 
 import grpc
@@ -36,14 +38,21 @@ class GrpcServer:
                 ("grpc.max_connection_idle_ms", int(settings.stream_idle_s * 1000)),
             ],
         )
-        methods: dict[str, Any] = {name: grpc.unary_unary_rpc_method_handler(self._unary(name)) for name in UNARY}
-        methods[STREAM] = grpc.stream_stream_rpc_method_handler(self._stream)
+        written: Callable[[Any], bytes] = methodcaller("SerializeToString")
+        methods: dict[str, Any] = {
+            name: grpc.unary_unary_rpc_method_handler(partial(self._answer, name), response_serializer=written)
+            for name in UNARY
+        }
+        methods[STREAM] = grpc.stream_stream_rpc_method_handler(self._grpc.stream, response_serializer=written)
         self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(SERVICE, methods),))
         service: Any = health  # its asyncio part is not in its type stubs
         self._health = service.aio.HealthServicer()  # probed by orchestrators, without a key
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        if settings.grpc_reflection:
-            _add_reflection(self._server)
+        if settings.grpc_reflection:  # grpcurl and others ask which methods and messages the protocol has
+            from grpc_reflection.v1alpha import reflection
+
+            pool = messages.ModelInferRequest.DESCRIPTOR.file.pool
+            reflection.enable_server_reflection((SERVICE, reflection.SERVICE_NAME), self._server, pool=pool)
 
     async def start(self) -> None:
         """Listen, and report the health status "serving". Raises UnavailableError if it cannot listen on the port."""
@@ -60,23 +69,7 @@ class GrpcServer:
         await self._health.enter_graceful_shutdown()
         await self._server.stop(DRAIN_S)
 
-    def _unary(self, name: str) -> Callable[[bytes, Any], Awaitable[bytes]]:
-        async def call(content: bytes, context: Any) -> bytes:
-            remaining = context.time_remaining()
-            deadline = None if remaining is None or remaining > LONGEST_S else remaining
-            reply: bytes = (await self._grpc.answer(name, (content, deadline), context)).SerializeToString()
-            return reply
-
-        return call
-
-    async def _stream(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[bytes]:
-        async for reply in self._grpc.stream(requests, context):
-            yield reply.SerializeToString()
-
-
-def _add_reflection(server: Any) -> None:
-    """Let grpcurl and others ask which methods and messages the protocol has."""
-    from grpc_reflection.v1alpha import reflection
-
-    pool = messages.ModelInferRequest.DESCRIPTOR.file.pool
-    reflection.enable_server_reflection((SERVICE, reflection.SERVICE_NAME), server, pool=pool)
+    async def _answer(self, name: str, content: bytes, context: Any) -> Any:
+        remaining = context.time_remaining()
+        deadline = None if remaining is None or remaining > LONGEST_S else remaining
+        return await self._grpc.answer(name, (content, deadline), context)

@@ -11,22 +11,19 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Awaitable, Iterable
-from typing import Any, cast
+from collections.abc import Awaitable
+from typing import Any
 
-from uvicorn.config import Config
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
-from uvicorn.server import ServerState
 
 from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError, RlservoError
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, error_answer, send_reply
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
-LIMITS = "rlservo.limits"  # in the application's lifespan state, which uvicorn hands to each connection
+HANDLER = "rlservo.handler"  # in the application's lifespan state, which uvicorn hands to each connection
 HEAD_S = 5.0  # [s] for a request's head, from the connection's start or the head's first byte
 MAX_HEAD_BYTES = 16384  # of a head, or of trailers
 MAX_PIPELINED = 32  # requests that a connection may send before the first one is answered
@@ -41,21 +38,6 @@ VIOLATION = 1008  # WebSocket's close code for a client that violates the server
 CHECK_S = 1.0  # [s] between two checks of a connection's phase
 
 
-class ConnectionLimits:
-    """Limits that differ from server to server."""
-
-    def __init__(self, settings: ServerSettings, handler: RequestHandler) -> None:
-        self.per_address = settings.max_connections_per_address
-        self.body_s = settings.body_timeout_s
-        self._handler = handler
-
-    def refuse(self, error: RlservoError, client: tuple[str, int] | None) -> tuple[int, bytes]:
-        """Return (status, body) for a request that the application does not get; count and log it."""
-        request = Request("http", "", None, time.perf_counter(), peer=client and client[0])
-        self._handler.record_failure(request, error.code, error.message)
-        return error_answer(error)[:2]
-
-
 class _Refused(Exception):
     """A request is refused in a callback of the parser; httptools and uvicorn answer 400 for any exception in one."""
 
@@ -63,7 +45,6 @@ class _Refused(Exception):
 class BoundedHttp(HttpToolsProtocol):
     """A connection that ends when a client sends too much or takes too long."""
 
-    _check_timer: asyncio.TimerHandle | None = None
     _phase_limit_s: float | None = HEAD_S  # [s] None while nothing is awaited from the client
     _is_late = False  # whether the phase was beyond its limit at the last check
     _in_body = False
@@ -71,24 +52,15 @@ class BoundedHttp(HttpToolsProtocol):
     _trailer_bytes = 0
     _sentence = ""
 
-    def __init__(
-        self,
-        config: Config,
-        server_state: ServerState,
-        app_state: dict[str, Any],
-        _loop: asyncio.AbstractEventLoop | None = None,
-    ) -> None:
-        super().__init__(config, server_state, app_state, _loop)
-        self._limits: ConnectionLimits = app_state[LIMITS]
-        self._since = self.loop.time()
-
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Count the connection, and begin to wait for the first head."""
         super().connection_made(transport)
+        self._handler: RequestHandler = self.app_state[HANDLER]
+        self._since = self.loop.time()
         connection = transport.get_extra_info("socket")
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel closes it if a reply stays unread, also on a WebSocket
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNREAD_MS)
-        self._check_timer = self.loop.call_later(CHECK_S, self._check)
+        self.loop.call_later(CHECK_S, self._check)
         excess = self._excess()
         if excess >= SPARE:
             transport.abort()
@@ -97,22 +69,12 @@ class BoundedHttp(HttpToolsProtocol):
 
     def _excess(self) -> int:
         """Return the number of connections by which this address, or the process, exceeds its bound."""
-        total = len(self.connections) - MAX_CONNECTIONS
-        if not self._limits.per_address or self.client is None or len(self.connections) <= self._limits.per_address:
-            return total
-        peers: Iterable[Any] = cast("Iterable[Any]", self.connections)
-        own = sum(peer.client is not None and peer.client[0] == self.client[0] for peer in peers)
-        return max(int(own) - self._limits.per_address, total)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the checks."""
-        self._stop_checks()
-        super().connection_lost(exc)
-
-    def handle_websocket_upgrade(self) -> None:
-        """Hand the connection over to the WebSocket, which has its own bounds."""
-        self._stop_checks()
-        super().handle_websocket_upgrade()
+        total, most = len(self.connections), self._handler.settings.max_connections_per_address
+        own = 0
+        if most and self.client is not None and total > most:
+            peers: Any = self.connections
+            own = sum(1 for peer in peers if peer.client is not None and peer.client[0] == self.client[0])
+        return max(own - most, total - MAX_CONNECTIONS)
 
     def data_received(self, data: bytes) -> None:
         """Read the data; of a head, no more than is allowed."""
@@ -148,7 +110,7 @@ class BoundedHttp(HttpToolsProtocol):
             self._refuse(f"more than {MAX_PIPELINED} requests were sent before the first one was answered")
         self._in_body = True
         self._trailer_bytes = 0
-        self._await(self._limits.body_s)
+        self._await(self._handler.settings.body_timeout_s)
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
@@ -167,7 +129,9 @@ class BoundedHttp(HttpToolsProtocol):
         self._phase_limit_s, self._since, self._is_late = limit_s, self.loop.time(), False
 
     def _check(self) -> None:
-        self._check_timer = self.loop.call_later(CHECK_S, self._check)
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:  # a WebSocket has its own bounds
+            return
+        self.loop.call_later(CHECK_S, self._check)
         if self._phase_limit_s is None or self.loop.time() - self._since <= self._phase_limit_s:
             return
         if not self._is_late:  # a starved process may still have to read data that came in time
@@ -176,11 +140,6 @@ class BoundedHttp(HttpToolsProtocol):
             self.transport.abort()  # it was answered, and the rest of its body never came
         else:
             self._end(DeadlineError(f"the request did not arrive within {self._phase_limit_s:g} s"))
-
-    def _stop_checks(self) -> None:
-        if self._check_timer is not None:
-            self._check_timer.cancel()
-            self._check_timer = None
 
     def _check_upgrade(self, method: bytes) -> None:
         """Refuse any Upgrade except a WebSocket's without a body, since uvicorn would drop the body."""
@@ -199,17 +158,23 @@ class BoundedHttp(HttpToolsProtocol):
         if self.cycle is not None and not self.cycle.response_complete:
             self.cycle.disconnected = True  # a later reply of the application is dropped
             self.cycle.message_event.set()
-        status, content = self._limits.refuse(error, self.client)
+        status, content = self._answer_to(error)
         self.transport.write(
             b"HTTP/1.1 %d \r\ncontent-type: application/json\r\nconnection: close\r\ncontent-length: %d\r\n\r\n%s"
             % (other_status or status, len(content), content)
         )
         self.transport.close()
 
+    def _answer_to(self, error: RlservoError) -> tuple[int, bytes]:
+        """Return (status, body) for a request that the application does not get; count and log it."""
+        request = Request("http", "", None, time.perf_counter(), peer=self.client and self.client[0])
+        self._handler.record_failure(request, error)
+        return error_answer(error)[:2]
+
     def _refuse_connection(self, _scope: Scope, _receive: Receive, send: Send) -> Awaitable[None]:
-        count = self._limits.per_address
+        count = self._handler.settings.max_connections_per_address
         sentence = f"your address has more than {count} connections, or all clients have {MAX_CONNECTIONS}: close some"
-        _, content = self._limits.refuse(OverloadedError(sentence), self.client)
+        _, content = self._answer_to(OverloadedError(sentence))
         return send_reply(send, 429, content, (*JSON_HEADERS, (b"retry-after", b"1"), (b"connection", b"close")))
 
 

@@ -27,11 +27,10 @@ from uvicorn.supervisors import Multiprocess
 
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.engines.http_bounds import (
-    LIMITS,
+    HANDLER,
     MAX_CONNECTIONS,
     BoundedHttp,
     BoundedWebSocket,
-    ConnectionLimits,
 )
 from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.serving import Serving
@@ -42,6 +41,7 @@ from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.metrics import FOLDER_VARIABLE, shared_by_workers
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.asgi import ASGIApp, Receive, Scope, Send
@@ -53,7 +53,6 @@ DRAIN_S = 15  # [s] for requests in progress when the server stops
 HUNG_S = 30  # [s] until an unresponsive worker is replaced; a start on a busy machine takes as long
 EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
 DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a server at full load needs
-FEWEST_DESCRIPTORS = 64  # with fewer a server cannot start
 UVICORN = logging.getLogger("uvicorn.error")
 
 
@@ -107,6 +106,7 @@ def serve_policies(
     if keys.operator is not None or any(key.role is Role.admin for key in keys.keys):
         admin_key_file = None
     _raise_descriptor_limit()
+    stopping = on_stop or (lambda: None)
     with contextlib.ExitStack() as stack:
         listener = stack.enter_context(contextlib.closing(listen(host, port)))
         if grpc_port is not None:
@@ -121,14 +121,24 @@ def serve_policies(
         url = f"http://{shown}:{listener.getsockname()[1]}"
         grpc = None if grpc_port is None else f"{shown}:{grpc_port}"
 
-        def ready(policies: Sequence[tuple[str, str]]) -> None:
+        def ready(store: PolicyStore) -> None:
+            policies = tuple((name, store.default(name)) for name in store.names)
             if on_ready is not None:
-                on_ready(RunningServer(url, tuple(policies), grpc, admin_key_file if digest else None))
+                on_ready(RunningServer(url, policies, grpc, admin_key_file if digest else None))
 
-        if workers == 1:
-            _run_here(server, listener, ready, on_stop, stop, in_main)
-        else:
-            _run_workers(server, listener, ready, on_stop)
+        if workers > 1:
+            _run_workers(server, listener, ready, stopping)
+            return
+        server.on_ready = ready
+        running = _Server(server.config(), stopping, stop)
+        configure(chosen)
+        UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
+        if in_main:
+            stack.enter_context(_stop_signals(lambda: setattr(running, "should_exit", True)))
+        try:
+            running.run(sockets=[listener])
+        except SystemExit:
+            raise server.failure or UnavailableError("the server could not start: see its log") from None
 
 
 @dataclass
@@ -144,9 +154,10 @@ class EmbeddedServer:
     workers: int
     settings: ServerSettings
     served: dict[str, Any]
-    failure: RlservoError | None = None
+    on_ready: Callable[[PolicyStore], None] | None = None
+    """Called when the policies are loaded: connections to the socket, which listens already, are answered."""
+    failure: Exception | None = None
     """Reason why the start failed, in the process that serves."""
-    policies: tuple[tuple[str, str], ...] = ()
     app: ASGIApp | None = None
     """The application, once it has started."""
 
@@ -156,22 +167,22 @@ class EmbeddedServer:
 
     async def _live(self, scope: Scope, receive: Receive, send: Send) -> None:
         await receive()
-        is_worker = self.workers > 1
         try:
             async with contextlib.AsyncExitStack() as stack:
-                await self._start(stack, scope["state"], is_worker=is_worker)
+                await self._start(stack, scope["state"])
                 await send({"type": "lifespan.startup.complete"})
                 await receive()
-        except RlservoError as error:
+        except (RlservoError, OSError) as error:
             self.failure = error
-            if is_worker:
-                logger.error("a worker could not start: %s", error.message)
+            if self.workers > 1:
+                logger.error("a worker could not start: %s", error)
             await send({"type": "lifespan.startup.failed", "message": ""})
             return
         await send({"type": "lifespan.shutdown.complete"})
 
-    async def _start(self, stack: contextlib.AsyncExitStack, state: dict[str, Any], *, is_worker: bool) -> None:
-        settings, replica = self.settings, str(os.getpid()) if is_worker else ""
+    async def _start(self, stack: contextlib.AsyncExitStack, state: dict[str, Any]) -> None:
+        settings, is_worker = self.settings, self.workers > 1
+        replica = str(os.getpid()) if is_worker else ""
         if is_worker:
             configure(settings, replica=replica)
             _stop_with_parent()
@@ -183,15 +194,16 @@ class EmbeddedServer:
             raise UsageError(
                 f"the default policy '{settings.default_policy}' is not served: expected {', '.join(store.names)}"
             )
-        self.policies = tuple((name, store.default(name)) for name in store.names)
         if self.grpc_port is not None:
             from rlservo.serve_app.engines.grpc_server import GrpcServer  # takes a quarter of the start
 
             grpc = GrpcServer(serving.handler, self.host, self.grpc_port, is_shared=is_worker)
             await grpc.start()
             stack.push_async_callback(grpc.stop)
-        state[LIMITS] = ConnectionLimits(settings, serving.handler)
+        state[HANDLER] = serving.handler
         self.app = serving.app
+        if self.on_ready is not None:
+            self.on_ready(store)
 
     def config(self) -> uvicorn.Config:
         """Return uvicorn's configuration."""
@@ -233,65 +245,34 @@ def _stop_with_parent() -> None:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server, which reports when it is ready and when it begins to stop, and stops on an event."""
+    """uvicorn's server, which reports when it begins to stop, and stops on an event."""
 
-    def __init__(
-        self,
-        config: uvicorn.Config,
-        on_ready: Callable[[], None],
-        on_stop: Callable[[], None] | None,
-        stop: threading.Event | None,
-    ) -> None:
+    def __init__(self, config: uvicorn.Config, on_stop: Callable[[], None], stop: threading.Event | None) -> None:
         super().__init__(config)
-        self._on_ready, self._on_stop, self._stop = on_ready, on_stop, stop
+        self._on_stop, self._stop = on_stop, stop
 
     async def on_tick(self, counter: int) -> bool:
         """Return whether to stop."""
         return await super().on_tick(counter) or (self._stop is not None and self._stop.is_set())
 
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Load the policies and listen."""
-        await super().startup(sockets)
-        if self.started:
-            self._on_ready()
-
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Answer the requests in progress, and stop."""
-        if self._on_stop is not None:
-            self._on_stop()
+        self._on_stop()
         await super().shutdown(sockets)
-
-
-def _run_here(
-    server: EmbeddedServer,
-    listener: socket.socket,
-    ready: Callable[[Sequence[tuple[str, str]]], None],
-    on_stop: Callable[[], None] | None,
-    stop: threading.Event | None,
-    in_main: bool,
-) -> None:
-    running = _Server(server.config(), lambda: ready(server.policies), on_stop, stop)
-    configure(server.settings)
-    UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
-    with _stop_signals(lambda: setattr(running, "should_exit", True)) if in_main else contextlib.nullcontext():
-        try:
-            running.run(sockets=[listener])
-        except SystemExit:
-            raise server.failure or UnavailableError("the server could not start: see its log") from None
 
 
 def _run_workers(
     server: EmbeddedServer,
     listener: socket.socket,
-    ready: Callable[[Sequence[tuple[str, str]]], None],
-    on_stop: Callable[[], None] | None,
+    on_ready: Callable[[PolicyStore], None],
+    on_stop: Callable[[], None],
 ) -> None:
     # Faults of the policies are reported here, once, before any worker starts.
-    with contextlib.closing(load_served(server.places, ServedConfig.parse(server.served), server.settings)) as store:
-        policies = tuple((name, store.default(name)) for name in store.names)
+    store = load_served(server.places, ServedConfig.parse(server.served), server.settings)
+    store.close()
     UVICORN.setLevel(logging.INFO)
     with _stop_signals(lambda: None), shared_by_workers():  # the first restores the supervisor's signal handlers
-        supervisor = _Supervisor(server.config(), [listener], lambda: ready(policies), on_stop)
+        supervisor = _Supervisor(server.config(), listener, lambda: on_ready(store), on_stop)
         supervisor.run()
     if not supervisor.is_asked_to_stop:
         raise UnavailableError("a worker could not start: see the lines above")
@@ -301,13 +282,9 @@ class _Supervisor(Multiprocess):
     """uvicorn's supervisor, which reports when all workers are ready and kills those that do not exit."""
 
     def __init__(
-        self,
-        config: uvicorn.Config,
-        sockets: list[socket.socket],
-        on_ready: Callable[[], None],
-        on_stop: Callable[[], None] | None,
+        self, config: uvicorn.Config, listener: socket.socket, on_ready: Callable[[], None], on_stop: Callable[[], None]
     ) -> None:
-        super().__init__(config, sockets)
+        super().__init__(config, [listener])
         self._on_ready: Callable[[], None] | None = on_ready
         self._on_stop = on_stop
         self.is_asked_to_stop = False
@@ -328,19 +305,14 @@ class _Supervisor(Multiprocess):
             self._on_ready()
             self._on_ready = None
 
-    def handle_int(self) -> None:
-        """Stop on Ctrl-C."""
-        self._stop()
-
     def handle_term(self) -> None:
-        """Stop on SIGTERM."""
-        self._stop()
-
-    def _stop(self) -> None:
-        if not self.is_asked_to_stop and self._on_stop is not None:
+        """Stop on SIGTERM, and on Ctrl-C."""
+        if not self.is_asked_to_stop:
             self._on_stop()
         self.is_asked_to_stop = True
         self.should_exit.set()
+
+    handle_int = handle_term
 
     def join_all(self) -> None:
         """Wait for the workers to exit, and kill those that do not."""
@@ -373,13 +345,11 @@ def _stop_signals(request_stop: Callable[[], None]) -> Iterator[None]:
 
 
 def _raise_descriptor_limit() -> None:
-    """Raise the limit of open files to what a full server needs, as far as possible. Raises UsageError."""
+    """Raise the limit of open files to what a full server needs, as far as possible."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-    if hard != resource.RLIM_INFINITY and hard < FEWEST_DESCRIPTORS:
-        raise UsageError(f"this process may open {hard} files, a server needs {FEWEST_DESCRIPTORS}: raise 'ulimit -n'")
     if hard != resource.RLIM_INFINITY and hard < DESCRIPTORS:
         logger.warning(
             "this process may open %d files: about %d connections at once fit, further ones wait", hard, hard - 64

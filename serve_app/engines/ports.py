@@ -20,16 +20,12 @@ def listen(host: str, port: int, *, option: str = "--port") -> socket.socket:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
     except OSError as error:
         raise UsageError(f"host '{host}' is not an address of this machine: {error.strerror}") from error
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # closed connections that linger do not matter
+    is_ipv6 = family == socket.AF_INET6
     try:
         _check_route(family, address)
-        listener.bind(address)
-        listener.listen(BACKLOG)
+        return socket.create_server(address, family=family, backlog=BACKLOG, dualstack_ipv6=is_ipv6)
     except OSError as error:
-        listener.close()
         raise UsageError(_why_not(host, port, option, error)) from error
-    return listener
 
 
 def _check_route(family: int, address: Any) -> None:

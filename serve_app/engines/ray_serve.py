@@ -29,7 +29,6 @@ from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.wire.addresses import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -53,9 +52,6 @@ class BuildArguments(BaseModel):
     replicas: int = Field(1, ge=1)
     """Processes that serve the same policies; each loads all of them."""
 
-    served: dict[str, Any] = {}
-    """Versions, aliases, canary and shadow (ServedConfig), where `user_config` cannot be given; `user_config` wins."""
-
     settings: dict[str, Any] = {}
     """Fields of ServerSettings; missing ones come from RLSERVO_* variables, then from the defaults."""
 
@@ -71,13 +67,12 @@ def build(args: BuildArguments) -> Application:
     Relative folders are resolved here, since a replica runs in another directory.
     """
     settings = ServerSettings.from_environment(args.settings)
-    ServedConfig.parse(args.served)
     # A folder may exist only on the nodes that run replicas, so the replica checks it.
     places = [place_of(place) for place in args.policies]
     server: Deployment = cast("Deployment", PolicyServer)  # the decorator is typed as if it returned the class
     # Above a replica's own limit: requests held back by Serve would wait behind clients that send bodies slowly.
     limit = settings.max_ongoing_requests + settings.max_incoming + settings.max_streams + SPARE
-    options = server.options(num_replicas=args.replicas, max_ongoing_requests=limit, user_config=args.served)
+    options = server.options(num_replicas=args.replicas, max_ongoing_requests=limit)
     return options.bind(places, settings.model_dump())
 
 
@@ -122,7 +117,6 @@ class PolicyServer(InferenceMethods):
         """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
         self._settings = ServerSettings(**settings)
         self._load = Load()
-        self._is_started = False
         replica = serve.get_replica_context().replica_tag
         host = _listening_host()
         try:
@@ -149,14 +143,13 @@ class PolicyServer(InferenceMethods):
 
         Serve sends a replica no requests while this runs, so only the first call waits until everything is loaded.
         """
-        if self._is_started:
+        if self._serving.control.store is not None:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
             return
         try:
             await self._serving.start(user_config)
         except RlservoError as error:
             raise _plain(error) from None
-        self._is_started = True
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Report this replica's load to Serve's autoscaler, for `autoscaling.by_load`."""
@@ -165,7 +158,7 @@ class PolicyServer(InferenceMethods):
     async def check_health(self) -> None:
         """Report that the event loop runs and the policies are loaded; otherwise Serve replaces this replica."""
         await asyncio.sleep(0)
-        if not self._is_started:
+        if self._serving.control.store is None:
             raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, not null")
 
     async def __del__(self) -> None:

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.sampled_metrics import keep_sampled
+from rlservo.serve_app.server.metrics import keep_sampled
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import plan_files, version_loader
+from rlservo.serve_app.server.start_check import loader_and_plans
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 
@@ -32,8 +32,7 @@ class Serving:
         `is_alone` says whether every request reaches this process. Nothing is loaded yet. Raises UsageError.
         """
         self.settings = settings
-        loader, files = version_loader(places, settings), plan_files(places, settings)
-        self.control = PlanFollower(loader, files)
+        self.control = PlanFollower(*loader_and_plans(places, settings))
         self.app = create_app(
             lambda: self.control.store,
             settings,
@@ -52,7 +51,7 @@ class Serving:
         Raises UsageError, BundleError and UnavailableError.
         """
         await self.control.configure(served)
-        self.handler.admission.loop_clock.start()
+        self.handler.admission.start_clock()
         self._tasks.append(asyncio.create_task(self.control.poll_plan()))
         if self.handler.metrics.is_shared:
             self._tasks.append(asyncio.create_task(keep_sampled(self.handler)))
@@ -64,16 +63,7 @@ class Serving:
 
     async def stop(self) -> None:
         """End the background tasks, close connections and complete the recording."""
-        await cancel_all(self._tasks)
-        await self.handler.close()
-        if self.handler.recorder is not None:
-            await asyncio.to_thread(self.handler.recorder.close)
-
-
-async def cancel_all(tasks: Sequence[asyncio.Task[None]]) -> None:
-    """Cancel tasks until they have ended: `asyncio.wait_for` before Python 3.12 may lose a cancellation."""
-    left = set(tasks)
-    while left:
-        for task in left:
+        for task in self._tasks:  # none waits with `asyncio.wait_for`, which may lose a cancellation before Python 3.12
             task.cancel()
-        _, left = await asyncio.wait(left, timeout=1.0)
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.handler.close()

@@ -16,10 +16,10 @@ from rlservo.serve_app.protocols import (
 from rlservo.serve_app.protocols.http_endpoint import PolicyApp
 from rlservo.serve_app.protocols.http_errors import Headers
 from rlservo.serve_app.protocols.routes import GET, Call, Route, RoutingTable
-from rlservo.serve_app.server.access_checks import AccessChecks, Hosts
+from rlservo.serve_app.server.access_checks import OriginChecks
 from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.request_handler import RequestHandler, StoreProvider
-from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 
@@ -41,7 +41,7 @@ def create_app(
     UsageError when the API keys that `settings` name cannot be read.
     """
     handler = RequestHandler(store_provider, settings, replica=replica, control=control, is_alone=is_alone)
-    checks = AccessChecks(Hosts(host, settings, keyed=bool(handler.keys.accepted.keys)), handler.keys)
+    checks = OriginChecks(host, settings, keyed=bool(handler.keys.accepted.keys))
     routes = [
         *json_codec.routes(handler),
         *websocket_stream.routes(handler),

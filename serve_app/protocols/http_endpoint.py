@@ -37,10 +37,12 @@ from rlservo.serve_app.server.access_checks import (
     MAY_EXPLORE,
     REPLY_HEADERS,
     REQUEST_ID,
-    AccessChecks,
+    OriginChecks,
+    authorize,
     check_path,
     fold_headers,
     header_text,
+    presented_key,
 )
 from rlservo.serve_app.server.api_keys import Access, Key
 from rlservo.serve_app.server.logs import AuditEntry
@@ -59,7 +61,7 @@ class PolicyApp:
     """The ASGI application: finds each connection's route, and checks the client before it reads the body."""
 
     def __init__(
-        self, handler: RequestHandler, checks: AccessChecks, table: RoutingTable, *, is_behind_serve: bool = False
+        self, handler: RequestHandler, checks: OriginChecks, table: RoutingTable, *, is_behind_serve: bool = False
     ) -> None:
         """`is_behind_serve`: Ray Serve adds the request id to replies, and its connections treat trailers as headers"""
         self.handler = handler
@@ -98,7 +100,6 @@ class PolicyApp:
         """Answer if there is no route, or one that takes the whole body."""
         headers = scope[HEADERS]
         entry = AuditEntry(scope.get("method", ""), path, peer_of(scope), header_text(headers, REQUEST_ID))
-        entry.is_administration = found.access is Access.admin
         own: Headers
         try:
             key = self._check(found, path, scope)
@@ -120,12 +121,14 @@ class PolicyApp:
         except ClientGoneError:
             return
         finally:
-            entry.write()
+            if found.access is Access.admin:
+                entry.write()
 
     def _check(self, found: Found, path: str, scope: Scope) -> Key | None:
-        """Return the key that permits a route. Raises what `check_path` and `AccessChecks.check` raise."""
+        """Return the key that permits a route. Raises what `check_path`, `OriginChecks.check` and `authorize` raise."""
         check_path(scope, path)
-        key = self._checks.check(scope, scope[HEADERS], found.access)
+        self._checks.check(scope, scope[HEADERS])
+        key = authorize(self.handler.keys, presented_key(scope[HEADERS]), found.access)
         if self._is_behind_serve and b"transfer-encoding" in scope[HEADERS]:
             raise RequestError("a chunked body is not accepted behind Ray Serve: send Content-Length")
         return key
@@ -134,7 +137,7 @@ class PolicyApp:
         headers, own = scope[HEADERS], scope[REPLY_HEADERS]
         request = Request(scope["type"], "", None, time.perf_counter(), peer=peer_of(scope))
         request.request_id = header_text(headers, REQUEST_ID)
-        self.handler.record_failure(request, error.code, error.message)
+        self.handler.record_failure(request, error)
         if scope["type"] == "http":
             await send_error(send, error, headers=own)
         else:

@@ -174,7 +174,7 @@ class Grpc:
             request.may_explore = key is None or key.may_explore
         except RlservoError as error:
             request.peer = context.peer()
-            self._handler.record_failure(request, error.code, error.message)
+            self._handler.record_failure(request, error)
             raise
         return request
 

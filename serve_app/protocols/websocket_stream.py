@@ -24,6 +24,7 @@ from rlservo.export.contract.errors import (
     OverloadedError,
     RlservoError,
     UnauthenticatedError,
+    UnavailableError,
     UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.request import Request, new_episode_id
@@ -85,7 +86,7 @@ class StreamEndpoint:
             opening.label = opening.label or opening.stream_id  # during a canary they all get the same version
             policy = handler.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
-            handler.record_failure(opening, error.code, error.message)
+            handler.record_failure(opening, error)
             await refuse_upgrade(scope, receive, send, error)
             return
         await receive()  # websocket.connect
@@ -157,7 +158,7 @@ class _Conversation:
             self.timer = self._check_after(left_s)
             return
         self.is_idle = True
-        self._handler.record_failure(self._opening, IDLE, SILENT)
+        self._handler.record_failure(self._opening, UnavailableError(SILENT), IDLE)
         self._closing = asyncio.create_task(self._close())  # after which the server reports a disconnect
 
     async def _close(self) -> None:

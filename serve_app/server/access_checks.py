@@ -11,8 +11,6 @@ Sources: Fetch Standard, section 3.1 (Origin); W3C Fetch Metadata Request Header
 from __future__ import annotations
 
 import functools
-import hashlib
-import hmac
 import ipaddress
 import re
 import socket
@@ -20,7 +18,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
-from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Keys, Role
+from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Role
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
@@ -36,7 +34,6 @@ HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+?)\.?(?::[0-9]{1,5})?")
 READING = frozenset({"GET", "HEAD", "OPTIONS"})  # methods that change nothing
 OWN_SITES = frozenset({b"same-origin", b"none"})  # 'none' is the user, not a page; 'same-site' is another port or name
 ALL_COUNT = frozenset({b"host", b"origin", b"sec-fetch-site", b"content-type", b"content-encoding"})
-UNREADABLE = b"x-rlservo-unreadable"  # names the header that is not UTF-8, of several with one name
 PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
@@ -56,8 +53,8 @@ def check_path(scope: Scope, path: str) -> None:
         )
 
 
-class Hosts:
-    """The names and addresses by which requests may call this server."""
+class OriginChecks:
+    """Refuses HTTP requests and WebSockets for another host, or from a page of another origin."""
 
     def __init__(self, listening_on: str, settings: ServerSettings, *, keyed: bool) -> None:
         """Take the address that the server listens on; `keyed`: whether every action needs an API key."""
@@ -70,6 +67,24 @@ class Hosts:
             self._names |= {socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
         self.permit = functools.lru_cache(HOSTS_REMEMBERED)(self._permit)
         """Returns whether a request with this `Host` is for this server."""
+
+    def check(self, scope: Scope, headers: Mapping[bytes, bytes]) -> None:
+        """Raise ForbiddenError for another host's request or another origin's page, RequestError for two hosts.
+
+        `headers` are the scope's (`fold_headers`).
+        """
+        host = headers.get(b"host")
+        if host is not None and b"," in host:
+            raise RequestError("the request has two Host headers: send one")
+        if host is not None and not self.permit(host):
+            raise ForbiddenError(
+                f"the request names the host '{host[:100].decode('latin-1')}': call it by its address, or name it in "
+                "RLSERVO_ALLOWED_HOSTS"
+            )
+        if (b"origin" in headers or b"sec-fetch-site" in headers) and (
+            scope["type"] == "websocket" or scope["method"] not in READING
+        ):
+            _check_page(headers.get(b"origin"), headers.get(b"sec-fetch-site"), host)
 
     def _permit(self, host: bytes) -> bool:
         match = HOST.fullmatch(host.decode("latin-1").lower())
@@ -103,7 +118,7 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     if presented is None:
         what = "administration needs an admin" if admin else "this server requires an API"
         raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
-    key = find_key(accepted, presented)
+    key = accepted.find(presented)
     if key is None:
         raise UnauthenticatedError("the server does not know this API key")
     if key.limit is not None:
@@ -113,69 +128,21 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     return key
 
 
-def find_key(keys: Keys, presented: bytes) -> Key | None:
-    """Return the key that was presented. It is compared with every stored digest, each in constant time."""
-    digest = hashlib.sha256(presented).digest()
-    found = None
-    for key in keys.keys if keys.operator is None else (*keys.keys, keys.operator):
-        if hmac.compare_digest(digest, key.digest):
-            found = key
-    return found
-
-
 class StreamKey:
-    """The key of an open stream: checked again after every change of the keys, and counted with every request."""
+    """The key of an open stream, checked and counted with every request: it may have been removed since."""
 
     def __init__(self, keys: CurrentKeys, presented: bytes | None) -> None:
         """Nothing is checked before the first request."""
         self._keys = keys
         self._presented = presented
-        self._changes = -1
-        self._key: Key | None = None
 
     def check(self) -> bool:
-        """Return whether the key may ask for exploring actions, after checking it for one more request.
+        """Return whether the key may ask for exploring actions.
 
         Raises as `authorize` does; RateLimitError concerns only this request.
         """
-        if self._changes != self._keys.changes:
-            changes = self._keys.changes
-            self._key = authorize(self._keys, self._presented, Access.act)
-            self._changes = changes
-        elif self._key is not None and self._key.limit is not None:
-            self._keys.limits.spend(self._key, self._key.limit)
-        return self._key is None or self._key.may_explore
-
-
-class AccessChecks:
-    """Refuses HTTP requests and WebSockets by their headers: wrong host, wrong origin, or no key."""
-
-    def __init__(self, hosts: Hosts, keys: CurrentKeys) -> None:
-        self._hosts = hosts
-        self._keys = keys
-
-    def check(self, scope: Scope, headers: Mapping[bytes, bytes], access: Access) -> Key | None:
-        """Return the key that permits `access`; `headers` are the scope's (`fold_headers`).
-
-        Raises ForbiddenError for another host's request or another origin's page, UnauthenticatedError or
-        ForbiddenError by the key, RequestError for a header that is not UTF-8.
-        """
-        host = headers.get(b"host")
-        if host is not None and b"," in host:
-            raise RequestError("the request has two Host headers: send one")
-        if host is not None and not self._hosts.permit(host):
-            raise ForbiddenError(
-                f"the request names the host '{host[:100].decode('latin-1')}': call it by its address, or name it in "
-                "RLSERVO_ALLOWED_HOSTS"
-            )
-        if (b"origin" in headers or b"sec-fetch-site" in headers) and (
-            scope["type"] == "websocket" or scope["method"] not in READING
-        ):
-            _check_page(headers.get(b"origin"), headers.get(b"sec-fetch-site"), host)
-        key = authorize(self._keys, presented_key(headers), access)
-        if UNREADABLE in headers or not all(map(bytes.isascii, headers.values())):
-            _check_readable(headers)
-        return key
+        key = authorize(self._keys, self._presented, Access.act)
+        return key is None or key.may_explore
 
 
 def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
@@ -187,8 +154,6 @@ def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:
     folded = {}
     for name, value in pairs:
         folded[name] = folded[name] + b", " + value if name in folded and name in ALL_COUNT else folded.get(name, value)
-        if not _is_utf8(value):
-            folded[UNREADABLE] = name
     return folded
 
 
@@ -196,14 +161,6 @@ def header_text(headers: Mapping[bytes, bytes], name: bytes) -> str | None:
     """Return a header as text, or None if it is absent."""
     value = headers.get(name)
     return None if value is None else value.decode("latin-1")
-
-
-def _is_utf8(value: bytes) -> bool:
-    try:
-        value.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def presented_key(headers: Mapping[bytes, bytes]) -> bytes | None:
@@ -215,15 +172,6 @@ def presented_key(headers: Mapping[bytes, bytes]) -> bytes | None:
             return key.strip()
     value = headers.get(b"x-api-key")
     return None if value is None else value.strip()
-
-
-def _check_readable(headers: Mapping[bytes, bytes]) -> None:
-    """Raise RequestError for a header that is not UTF-8."""
-    unreadable = headers.get(UNREADABLE)
-    if unreadable is None:
-        unreadable = next((name for name, value in headers.items() if not _is_utf8(value)), None)
-    if unreadable is not None:
-        raise RequestError(f"the header '{unreadable[:64].decode('latin-1')}' is not UTF-8")
 
 
 def _check_page(origin: bytes | None, site: bytes | None, host: bytes | None) -> None:

@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator
 
 from rlservo.export.contract.errors import LateError, OverloadedError
@@ -30,17 +31,36 @@ class Admission:
         self.max_wait_s = settings.max_queue_ms / 1e3
         self._max_incoming = settings.max_incoming
         self._max_streams = settings.max_streams
-        self.loop_clock = LoopClock(self.max_wait_s)
+        self._next_tick = float("inf")  # by time.perf_counter; infinite until the clock runs
+        self._unknown_until = 0.0  # until then it is unknown how long the data being read had waited
         self._burst = 0
         self._burst_began = 0.0
         self.incoming = 0
-        self.streams = 0
+        self.streams: Counter[str] = Counter()
+        """Open streams by policy."""
         self.longest = 0  # the longest burst so far
+
+    def start_clock(self) -> None:
+        """Tick in the running event loop from now on, to notice when it was blocked."""
+        self._next_tick = time.perf_counter()
+        self._tick()
+
+    def _tick(self) -> None:
+        """Remember a late tick: data read after it may have waited while the process or the machine stood still."""
+        now = time.perf_counter()
+        behind = now - self._next_tick
+        if behind > self.max_wait_s:
+            logger.warning("the event loop was blocked for %.1f s: requests that waited are refused", behind)
+            self._unknown_until = now + SETTLE_S
+        elif now < self._unknown_until and behind > TICK_S:  # still reading
+            self._unknown_until = now + SETTLE_S
+        self._next_tick = now + TICK_S
+        asyncio.get_running_loop().call_later(TICK_S, self._tick)
 
     def check_age(self) -> None:
         """Raise LateError for a request that may have waited too long to be read."""
         now = time.perf_counter()
-        if now < self.loop_clock.unknown_until or now - self.loop_clock.next_tick > self.max_wait_s:
+        if now < self._unknown_until or now - self._next_tick > self.max_wait_s:
             raise LateError(
                 f"the server was blocked for more than {self.max_wait_s * 1e3:g} ms, so the observation may be stale: "
                 "send a newer one"
@@ -80,47 +100,9 @@ class Admission:
         finally:
             self.incoming -= 1
 
-    def open_stream(self) -> None:
-        """Count an open stream. Raises OverloadedError."""
-        if self.streams >= self._max_streams:
-            raise OverloadedError(f"{self.streams} streams are open in this replica: close one, or try again shortly")
-        self.streams += 1
-
-    def close_stream(self) -> None:
-        """Count one stream less."""
-        self.streams -= 1
-
-
-class LoopClock:
-    """Ticks in the event loop, and remembers when a tick was late.
-
-    A stopped process, a long computation or a starved machine blocks the loop. Data that is read right afterwards may
-    have waited for that whole time.
-    """
-
-    def __init__(self, limit_s: float) -> None:
-        """Treat a tick that is later than `limit_s` as a blocked loop."""
-        self._limit_s = limit_s
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self.next_tick = float("inf")
-        """Time of the next tick, by `time.perf_counter`; infinite until the clock runs."""
-        self.unknown_until = 0.0
-        """Until then it is unknown how long the data being read had waited."""
-
-    def start(self) -> None:
-        """Tick in the running event loop from now on."""
-        self._loop = asyncio.get_running_loop()
-        self.next_tick = time.perf_counter()
-        self._tick()
-
-    def _tick(self) -> None:
-        now = time.perf_counter()
-        behind = now - self.next_tick
-        if behind > self._limit_s:
-            logger.warning("the event loop was blocked for %.1f s: requests that waited are refused", behind)
-            self.unknown_until = now + SETTLE_S
-        elif now < self.unknown_until and behind > TICK_S:  # still reading
-            self.unknown_until = now + SETTLE_S
-        self.next_tick = now + TICK_S
-        assert self._loop is not None
-        self._loop.call_later(TICK_S, self._tick)
+    def open_stream(self, policy: str) -> None:
+        """Count an open stream; its end is `streams[policy] -= 1`. Raises OverloadedError."""
+        count = sum(self.streams.values())
+        if count >= self._max_streams:
+            raise OverloadedError(f"{count} streams are open in this replica: close one, or try again shortly")
+        self.streams[policy] += 1

@@ -18,6 +18,7 @@ import secrets
 import stat
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from pathlib import Path
 
 from typing_extensions import Self
@@ -29,7 +30,7 @@ from rlservo.serve_app.wire.addresses import is_loopback
 
 LINE = re.compile(
     r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|explore|admin)\s+sha256:(?P<digest>[0-9a-f]{64})"
-    r"(?:\s+rate=(?P<rate>[0-9]{1,6}(?:\.[0-9]{1,3})?)(?:\s+burst=(?P<burst>[1-9][0-9]{0,5}))?)?"
+    r"(?:\s+rate=(?![0.]+(?:\s|$))(?P<rate>[0-9]{1,6}(?:\.[0-9]{1,3})?)(?:\s+burst=(?P<burst>[1-9][0-9]{0,5}))?)?"
 )
 KEY_PREFIX = "rlservo_"  # so that scanners for leaked secrets recognise it
 A_KEY = re.compile(re.escape(KEY_PREFIX) + r"[A-Za-z0-9_-]{16,}")
@@ -67,15 +68,6 @@ class RateLimit:
     rate: float  # requests a second
     burst: int  # requests at once, after a pause
 
-    @classmethod
-    def parse(cls, rate: str | None, burst: str | None) -> RateLimit | None:
-        """Return a line's limit; the default burst is one second's requests. Raises ValueError for 0."""
-        if rate is None:
-            return None
-        if not float(rate):
-            raise ValueError
-        return cls(float(rate), int(burst) if burst else max(1, math.ceil(float(rate))))
-
 
 @dataclass(frozen=True)
 class Key:
@@ -99,6 +91,14 @@ class Keys:
     operator: Key | None = None
     """For administration; a server with only this key requires none for actions."""
 
+    @cached_property
+    def _by_digest(self) -> dict[bytes, Key]:
+        return {key.digest: key for key in (*self.keys, *filter(None, [self.operator]))}
+
+    def find(self, presented: bytes) -> Key | None:
+        """Return the key that was presented. The time of a look-up by its SHA-256 helps no one to guess it."""
+        return self._by_digest.get(hashlib.sha256(presented).digest())
+
     @classmethod
     def from_settings(cls, settings: ServerSettings, *, file_content: bytes | None = None) -> Self:
         """Read the file (unless its content is given) and the entries in the settings. Raises UsageError."""
@@ -114,12 +114,11 @@ class Keys:
             if match is None:  # the line is not shown: it may hold a key by mistake
                 raise UsageError(
                     f"{where}: expected '<label> <act|explore|admin> sha256:<64 hexadecimal digits>', as 'rlservo key "
-                    "LABEL' makes it, optionally followed by 'rate=<requests a second> burst=<requests>'"
+                    "LABEL' makes it, optionally followed by 'rate=<requests a second> burst=<requests>', each above 0"
                 )
-            try:
-                limit = RateLimit.parse(match["rate"], match["burst"])
-            except ValueError:
-                raise UsageError(f"{where}: a rate of 0 would refuse every request: leave the line out") from None
+            limit = None
+            if match["rate"] is not None:  # without a burst, one second's requests may come at once
+                limit = RateLimit(float(match["rate"]), int(match["burst"] or math.ceil(float(match["rate"]))))
             keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"]), limit))
         if (settings.api_keys_file is not None or settings.api_keys.strip()) and not keys:
             raise UsageError(
@@ -147,7 +146,7 @@ def new_key(
         raise UsageError(f"label {label[:80]!r}: expected 1 to 64 letters, digits, '.', '_' and '-'")
     line += "" if rate is None else f" rate={rate:.3f}".rstrip("0").rstrip(".")
     line += "" if burst is None else f" burst={burst}"
-    if LINE.fullmatch(line) is None or (rate is not None and rate < 0.001):
+    if LINE.fullmatch(line) is None:
         raise UsageError("expected a rate of 0.001 to 999999 requests a second, and a burst of 1 to 999999")
     return key, line
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -38,10 +38,11 @@ class ContentBounds:
     content_bytes: int
     values: int
     """Entries of lists and maps, plus the lists and maps themselves, in msgpack, where arrays are maps."""
-    counts: Mapping[bytes, int]
-    """Allowed number of each of MARKS in JSON."""
-    densities: Mapping[bytes, float]
-    """Allowed number per byte: small bodies of large observations also have few lists."""
+    named: bytes
+    """JSON of every element's name: a batch may be a map from each to a list."""
+    parts: Sequence[Counter[bytes]]
+    """What a value of each kind in a request needs: observation, action, reward, recurrent states."""
+    max_batch: int
 
     @classmethod
     def of(cls, contract: Contract, max_batch: int) -> ContentBounds:
@@ -52,22 +53,26 @@ class ContentBounds:
         names = [
             element.name for leaf in leaf_specs(contract.observation_space, "").values() for element in leaf.elements
         ]
-        named = orjson.dumps(dict.fromkeys(names, 0))  # a batch may be a map from each name to a list
+        named = orjson.dumps(dict.fromkeys(names, 0))
         return cls(
             SPARE_BYTES + len(named) + max_batch * (row[LENGTH] + NUMBER_BYTES * row[b","]),
             SPARE
             + len(names)
             + max_batch * (row[b","] + row[b":"] + 2 * row[b"["] + 2 * row[b"{"] + ARRAY_VALUES * row[ARRAYS]),
-            {mark: SPARE + named.count(mark) + max_batch * row[mark] for mark in MARKS},
-            {mark: max(part[mark] / part[LENGTH] for part in parts) for mark in (b"[", b"{")},
+            named,
+            parts,
+            max_batch,
         )
 
     def exceeded_by(self, content: bytes) -> str:
         """Return the bound that the JSON exceeds, such as '900 lists', or ''."""
-        for mark, most in self.counts.items():
-            most = min(most, SPARE + int(self.densities.get(mark, 1.0) * len(content)))
+        # Small bodies of large observations have few lists: no more of each kind than the body has room for.
+        rows = [min(self.max_batch, len(content) // part[LENGTH] + 1) for part in self.parts]
+        for mark, what in MARKS.items():
+            most = SPARE + self.named.count(mark)
+            most += sum(each * part[mark] for each, part in zip(rows, self.parts, strict=True))
             if content.count(mark) > most:
-                return f"{most} {MARKS[mark]}"
+                return f"{most} {what}"
         return ""
 
 
@@ -121,22 +126,8 @@ def _need_of_array(shape: Sequence[int]) -> Counter[bytes]:
     return Counter({b",": numbers, b"[": lists, LENGTH: 2 * numbers + 2 * lists, ARRAYS: 1 + len(shape)})
 
 
-def most_rows(obs: Any) -> int:
-    """Return an upper bound on the number of observations in any space; `count_rows` counts precisely."""
-    most, parts = 0, [obs]
-    while parts:
-        part = parts.pop()
-        if type(part) is dict:
-            parts += part.values()
-        else:
-            most = max(most, _length(part))
-            if type(part) in (list, tuple) and part and type(part[0]) in (dict, list, tuple, np.ndarray):
-                parts.append(part[0])  # the parts of a Tuple share one batch
-    return most
-
-
 def count_rows(space: SpaceSpec, obs: Any) -> int:
-    """Return the number of observations in a large `obs`; an array as long as the space's is one."""
+    """Return the number of observations in `obs`, which may be anything; an array as long as the space's is one."""
     if isinstance(space, DictSpec | TupleSpec):
         if isinstance(space, DictSpec) and type(obs) is list:
             return len(obs)  # of single observations

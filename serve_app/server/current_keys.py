@@ -19,38 +19,36 @@ from rlservo.export.contract.errors import RateLimitError, UsageError
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, read_key_file
 from rlservo.serve_app.server.settings import ServerSettings
 
+logger = logging.getLogger(__name__)
+
+PERIOD_S = 0.5  # [s] between reads; content is used once two in a row agree, as one may catch a half-written file
+STALE_S = 10.0  # [s] without an answer from the file system until the keys count as outdated
+ROUNDING_S = 1e-6
+
 
 class RateLimits:
     """Remaining requests of each key with a limit. Keys without a limit are not tracked."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._buckets: dict[str, tuple[float, float]] = {}  # by label: tokens, and when they were counted
+        self._rested_at: dict[str, float] = {}  # by label: when a whole burst may come again
         self.refused: Counter[str] = Counter()
         """Requests refused, by label."""
 
     def spend(self, key: Key, limit: RateLimit) -> None:
         """Count a request of a key. Raises RateLimitError beyond its limit."""
         now = self._clock()
-        tokens, since = self._buckets.get(key.label, (float(limit.burst), now))
-        tokens = min(float(limit.burst), tokens + (now - since) * limit.rate)
-        if tokens < 1.0:
-            self._buckets[key.label] = tokens, now
+        rested_at = max(now, self._rested_at.get(key.label, now))
+        wait_s = rested_at - now - (limit.burst - 1) / limit.rate
+        if wait_s > ROUNDING_S:
             self.refused[key.label] += 1
-            wait_s = (1.0 - tokens) / limit.rate
             raise RateLimitError(
                 f"the key '{key.label}' allows {limit.rate:g} requests a second in this process, {limit.burst} at "
                 f"once: wait {wait_s:.3g} s",
                 {"retry_after_s": round(wait_s, 3)},
                 key=key.label,
             )
-        self._buckets[key.label] = tokens - 1.0, now
-
-
-logger = logging.getLogger(__name__)
-
-PERIOD_S = 0.5  # [s] between reads; content is used once two in a row agree, as one may catch a half-written file
-STALE_S = 10.0  # [s] without an answer from the file system until the keys count as outdated
+        self._rested_at[key.label] = rested_at + 1.0 / limit.rate
 
 
 class CurrentKeys:
@@ -62,14 +60,12 @@ class CurrentKeys:
         file = settings.api_keys_file
         content = None if file is None else read_key_file(Path(file))
         self.accepted = Keys.from_settings(settings, file_content=content)
-        """The keys that are accepted now."""
+        """The keys that are accepted now: another object after every change."""
         self.limits = RateLimits()
-        self._seen: bytes | str | None = content
+        self._seen: bytes | str | None = content  # or the reason why it could not be read
         self._used: bytes | str | None = content
-        self._refused = ""
+        self._is_refused = False
         self._looked_at = time.monotonic()
-        self.changes = 0
-        """Number of changes, which tells a caller whether to check a key again."""
         if file is not None:
             watcher = threading.Thread(target=_watch, args=(weakref.ref(self),), name="key-file", daemon=True)
             watcher.start()
@@ -79,13 +75,17 @@ class CurrentKeys:
         """Whether these are the file's current keys; False if the file cannot be used or read."""
         if self._settings.api_keys_file is None:
             return True
-        return not self._refused and time.monotonic() - self._looked_at < STALE_S
+        return not self._is_refused and time.monotonic() - self._looked_at < STALE_S
 
     def refresh(self) -> None:
         """Read the file; use its content once two reads in a row have seen the same."""
         assert self._settings.api_keys_file is not None
-        seen, before = _look(Path(self._settings.api_keys_file)), self._seen
-        self._seen, self._looked_at = seen, time.monotonic()
+        seen: bytes | str
+        try:
+            seen = read_key_file(Path(self._settings.api_keys_file))
+        except UsageError as error:
+            seen = error.message
+        before, self._seen, self._looked_at = self._seen, seen, time.monotonic()
         if seen != before or seen == self._used:
             return
         self._used = seen
@@ -94,23 +94,14 @@ class CurrentKeys:
                 raise UsageError(seen)
             keys = Keys.from_settings(self._settings, file_content=seen)
         except UsageError as error:
-            self._refused = error.message
+            self._is_refused = True
             logger.error("the API keys were not changed: %s", error.message)
             return
-        if self._refused or keys != self.accepted:
+        if self._is_refused or keys != self.accepted:
             logger.warning("the API keys were reread: %s", _difference(self.accepted, keys))
-        self._refused = ""
+        self._is_refused = False
         if keys != self.accepted:
             self.accepted = keys
-            self.changes += 1
-
-
-def _look(file: Path) -> bytes | str:
-    """Return the file's content, or the reason why it cannot be used."""
-    try:
-        return read_key_file(file)
-    except UsageError as error:
-        return error.message
 
 
 def _watch(reference: weakref.ref[CurrentKeys]) -> None:

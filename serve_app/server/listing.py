@@ -20,21 +20,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
     states = states_of(handler)
     policies = []
     for name in store.names:
-        contract = store.get(name).contract
-        arranged = store.plans[name]
-        shadow = store.shadow(name)
-        versions = []
-        for version, state in states.get(name, {}).items():
-            versions.append(
-                {
-                    "version": version,
-                    "state": state.state,
-                    "reason": state.reason,
-                    "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
-                    "loaded_at": state.loaded_at,
-                    "requests": handler.metrics.requests(name, version),
-                }
-            )
+        contract, arranged, shadow = store.get(name).contract, store.plans[name], store.shadow(name)
         policies.append(
             {
                 "name": name,
@@ -46,7 +32,15 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
                 "previous": {alias: earlier[-1] for alias, earlier in arranged.history.items() if earlier},
                 "canary": arranged.canary and arranged.canary.model_dump(),
                 "shadow": shadow and {"version": shadow.contract.version},
-                "version_states": versions,
+                "version_states": [
+                    {
+                        "version": version,
+                        **vars(state),
+                        "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
+                        "requests": handler.metrics.requests(name, version),
+                    }
+                    for version, state in states.get(name, {}).items()
+                ],
             }
         )
     return {

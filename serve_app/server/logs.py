@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 import time
 from dataclasses import dataclass
 from typing import Any
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.episodes.request import Request
+from rlservo.serve_app.server.access_checks import READING
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import Decision
@@ -23,6 +23,9 @@ from rlservo.serve_app.versions.policy_store import Decision
 LOGGER = "rlservo"
 FIELDS = "fields"  # attribute of a record that holds its fields
 LONGEST_ID = 128
+LONGEST = 256  # characters of a text that a client chose
+OK = "ok"
+UNANSWERED = "unanswered"  # its client hung up, or the replica ended: the change may or may not have been made
 
 _requests = logging.getLogger(f"{LOGGER}.requests")
 administration = logging.getLogger(f"{LOGGER}.administration")
@@ -53,33 +56,26 @@ class JsonFormatter(logging.Formatter):
 
 
 def configure(settings: ServerSettings, *, replica: str = "") -> None:
-    """Send this process's log as JSON to the settings' file or to standard error. Raises UsageError."""
-    handler: logging.Handler
-    handler = logging.StreamHandler(sys.stderr) if settings.log_file is None else logging.FileHandler(settings.log_file)
-    handler.setFormatter(JsonFormatter(replica))
+    """Send this process's log as JSON to the settings' file or to standard error; administration also to its own file.
+
+    Raises UsageError if a file cannot be written.
+    """
     logger = logging.getLogger(LOGGER)
-    for previous in list(logger.handlers):
-        logger.removeHandler(previous)
-        previous.close()
-    logger.addHandler(handler)
     logger.setLevel(settings.log_level.upper())
     logger.propagate = False
-    _log_administration(settings, replica)
-
-
-def _log_administration(settings: ServerSettings, replica: str) -> None:
-    """Log administration at any log level, and to the audit file if there is one."""
-    administration.setLevel(logging.INFO)
-    for previous in list(administration.handlers):
-        administration.removeHandler(previous)
-        previous.close()
-    if settings.audit_file is not None:
+    administration.setLevel(logging.INFO)  # at any level of the log
+    for each, what, file in ((logger, "log", settings.log_file), (administration, "audit", settings.audit_file)):
+        for previous in list(each.handlers):
+            each.removeHandler(previous)
+            previous.close()
+        if file is None and each is administration:
+            continue
         try:
-            handler = logging.FileHandler(settings.audit_file)
+            handler = logging.StreamHandler() if file is None else logging.FileHandler(file)
         except OSError as error:
-            raise UsageError(f"the audit file {settings.audit_file} cannot be written: {error.strerror}") from None
+            raise UsageError(f"the {what} file {file} cannot be written: {error.strerror}") from None
         handler.setFormatter(JsonFormatter(replica))
-        administration.addHandler(handler)
+        each.addHandler(handler)
 
 
 class RequestLog:
@@ -91,7 +87,7 @@ class RequestLog:
 
     def write_answer(self, request: Request, decision: Decision, seconds: float) -> None:
         """Write a request that got its action; check `every` first."""
-        fields = _fields(request, decision.name, decision.version, "ok", seconds)
+        fields = _fields(request, decision.name, decision.version, OK, seconds)
         fields["batch"] = decision.batch or 1
         _requests.info("answered", extra={FIELDS: fields})
 
@@ -110,7 +106,7 @@ class RequestLog:
 
 def _fields(request: Request, policy: str, version: str | None, code: str, seconds: float) -> dict[str, Any]:
     fields: dict[str, Any] = {
-        "request_id": _shorten(request.request_id),
+        "request_id": request.request_id and without_keys(request.request_id[:LONGEST_ID]),
         "protocol": request.protocol,
         "policy": policy,
         "version": version,
@@ -122,24 +118,14 @@ def _fields(request: Request, policy: str, version: str | None, code: str, secon
     return fields
 
 
-def _shorten(request_id: str | None) -> str | None:
-    return request_id and without_keys(request_id[:LONGEST_ID])
-
-
-OK = "ok"
-UNANSWERED = "unanswered"  # its client hung up, or the replica ended: the change may or may not have been made
-LONGEST = 256  # characters of a text that a client chose
-
-
 @dataclass
 class AuditEntry:
-    """One request and its outcome."""
+    """One request for administration and its outcome: the fields of its line, in which clients' texts are shortened."""
 
     method: str
     path: str
     peer: str | None
     request_id: str | None
-    is_administration: bool = False
     key: str = ""
     """The label of its key; empty if none was accepted."""
     command: str = ""
@@ -147,32 +133,14 @@ class AuditEntry:
     version: str | None = None
     change: str = ""
     """The command as a user would type it."""
-    code: str = ""
+    code: str = UNANSWERED
     """`ok`, or the error's code."""
     generation: int | None = None
 
     def write(self) -> None:
         """Write the line for a command; reading is not a command, unless it was refused."""
-        if not self.is_administration or (self.method in ("GET", "HEAD", "OPTIONS") and self.code in ("", OK)):
+        if self.method in READING and self.code in (UNANSWERED, OK):
             return
-        code = self.code or UNANSWERED
-        fields: dict[str, Any] = {
-            "request_id": None if self.request_id is None else _safe(self.request_id[:LONGEST_ID]),
-            "method": self.method,
-            "path": _safe(self.path),
-            "command": self.command,
-            "policy": _safe(self.policy),
-            "version": None if self.version is None else _safe(self.version),
-            "change": _safe(self.change.strip()),
-            "code": code,
-            "key": self.key,
-            "peer": self.peer,
-        }
-        if self.generation is not None:
-            fields["generation"] = self.generation
-        administration.info("changed" if code == OK else "refused", extra={FIELDS: fields})
-
-
-def _safe(text: str) -> str:
-    """Return a client's text, shortened; a key sent in the wrong place does not reach the log."""
-    return without_keys(text[:LONGEST])
+        # A key sent in the wrong place does not reach the log.
+        fields = {name: without_keys(v[:LONGEST]) if isinstance(v, str) else v for name, v in vars(self).items()}
+        administration.info("changed" if self.code == OK else "refused", extra={FIELDS: fields})

@@ -8,7 +8,7 @@ from typing import Any
 
 from rlservo.export.contract.errors import RequestError, UsageError
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import plan_files, version_loader
+from rlservo.serve_app.server.start_check import loader_and_plans
 from rlservo.serve_app.versions.plan_commands import Changed, parse
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan
@@ -19,9 +19,7 @@ class OfflineCommands:
 
     def __init__(self, places: Sequence[str]) -> None:
         """Take the places that `rlservo serve` gets, in the same order. Raises UsageError."""
-        settings = ServerSettings.from_environment()
-        self._files = plan_files(places, settings)
-        self._loader = version_loader(places, settings)
+        self._loader, self._files = loader_and_plans(places, ServerSettings.from_environment())
 
     def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
         """Carry out a command on a policy; return its new listing, as the server would."""
@@ -42,24 +40,20 @@ class OfflineCommands:
     async def _listing(self) -> dict[str, Any]:
         plan = await self._files.call(self._files.newest)
         listing = await self._loader.look()
-        digests, errors = listing.digests, listing.errors.values()
-        if plan is None and not digests:
-            listing.available(needs_all=True)
-        policies = {} if plan is None else plan.policies
-        others: dict[str, list[str]] = {name: [] for name, policy in policies.items() if policy.versions}
-        for name, versions in digests.items():
-            loaded = policies[name].versions if name in policies else {}
+        if plan is None:
+            if not listing.digests:
+                listing.available(needs_all=True)
+            plan = Plan(generation=0, policies={}, changed_by="")
+        others: dict[str, list[str]] = {name: [] for name, policy in plan.policies.items() if policy.versions}
+        for name, versions in listing.digests.items():
+            loaded = plan.policies[name].versions if name in plan.policies else {}
             others[name] = [version for version in versions if version not in loaded]
+        described = {name: Changed.of(plan, name).model_dump(exclude={"generation", "policy"}) for name in others}
         return {
             "place": self._files.place,
-            "generation": 0 if plan is None else plan.generation,
-            "changed_by": plan and plan.changed_by,
-            "changed_at": plan and plan.changed_at,
-            "policies": [{**_described(plan, name), "not_loaded": others[name]} for name in sorted(others)],
-            "errors": [error.message for error in errors],
+            "generation": plan.generation,
+            "changed_by": plan.changed_by or None,
+            "changed_at": plan.changed_at or None,
+            "policies": [{"name": name, **described[name], "not_loaded": others[name]} for name in sorted(others)],
+            "errors": [error.message for error in listing.errors.values()],
         }
-
-
-def _described(plan: Plan | None, name: str) -> dict[str, Any]:
-    changed = Changed.of(plan or Plan(generation=0, policies={}), name)
-    return {"name": name, **changed.model_dump(exclude={"generation", "policy"})}

@@ -9,6 +9,7 @@ as tasks that the loop has created and not yet run.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import time
@@ -24,6 +25,7 @@ from rlservo.export.contract.errors import (
     RlservoError,
     TooLargeError,
     UnavailableError,
+    UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import NO_EPISODE, ClientGoneError, Request, check_deadline
@@ -31,7 +33,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
-from rlservo.serve_app.server.content_bounds import count_rows, most_rows
+from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.current_keys import CurrentKeys
 from rlservo.serve_app.server.logs import FIELDS, RequestLog
 from rlservo.serve_app.server.metrics import Metrics
@@ -41,7 +43,6 @@ from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blame
 from rlservo.serve_app.versions.shadow import Shadows
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.episodes.redis_sessions import RedisSessions
     from rlservo.serve_app.server.request_recorder import RequestRecorder
 
 logger = logging.getLogger(__name__)
@@ -94,14 +95,16 @@ class RequestHandler:
         self.replica = replica
         self.keys = CurrentKeys(settings)
         self._store_provider = store_provider
-        self._max_batch = settings.max_batch
         self.settings = settings
         self.admission = Admission(settings)
+        sessions = None
+        if settings.session_store != MEMORY:
+            from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only several workers need it
+
+            patience_s = self.admission.max_wait_s
+            sessions = RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=patience_s)
         self.episodes = Episodes(
-            max_sessions=settings.max_sessions,
-            idle_s=settings.session_idle_s,
-            store=_session_store(settings),
-            is_alone=is_alone,
+            max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, store=sessions, is_alone=is_alone
         )
         self.metrics = Metrics(replica)
         self.log = RequestLog(settings)
@@ -114,9 +117,11 @@ class RequestHandler:
             self.episodes.marks_states = True
 
     async def close(self) -> None:
-        """Close the connections to other services."""
+        """Close the connections to other services, and complete the recording."""
         if self.episodes.store is not None:
             await self.episodes.store.close()
+        if self.recorder is not None:
+            await asyncio.to_thread(self.recorder.close)
 
     def policies(self) -> Iterator[tuple[str, str, Policy]]:
         """Yield (name, version, policy) of every loaded version."""
@@ -159,8 +164,7 @@ class RequestHandler:
         except ClientGoneError:
             raise
         except RlservoError as error:
-            asked, counted_as = blamed_version(error), self._counted_as(request, error)
-            self.record_failure(request, error.code, error.message, asked=asked, counted_as=counted_as)
+            self.record_failure(request, error)
             if self.recorder is not None:
                 self.recorder.note_failure(request, self._store_provider(), error)
             raise
@@ -185,8 +189,8 @@ class RequestHandler:
         store, name, obs = self.store(), request.policy, request.obs
         if request.deadline_ms is not None and (time.perf_counter() - request.received) * 1e3 >= request.deadline_ms:
             check_deadline(request)  # raises: time has passed since
-        single = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
-        if (len(obs) if single else most_rows(obs)) > self._max_batch:
+        is_flat = type(obs) is list and obs and type(obs[0]) is float  # the usual observation
+        if not is_flat or len(obs) > self.settings.max_batch:
             self._check_batch(store, request)
         decision = await self.episodes.act(store, request)
         shadow = store.shadow(name)
@@ -194,29 +198,24 @@ class RequestHandler:
             self.shadows.offer(shadow, obs, decision)
         return decision
 
-    def record_failure(
-        self,
-        request: Request,
-        code: str,
-        sentence: str,
-        *,
-        asked: str | None = None,
-        counted_as: str | None = None,
-    ) -> None:
-        """Count and log a request that got no action; requests for unknown names share one count.
+    def record_failure(self, request: Request, error: RlservoError, code: str = "") -> None:
+        """Count and log a request that got no action, under the error's code or another one.
 
-        `asked` is the version that failed, if one was asked; `counted_as` is the code in the metrics, if it differs.
+        Requests for unknown names share one count.
         """
-        name, version = request.policy, request.version
-        store = self._store_provider()
+        name, version, asked = request.policy, request.version, blamed_version(error)
+        store, code = self._store_provider(), code or error.code
+        counted_as = code
         if store is None or name not in store.names:
             name = version = ""
         elif asked is not None:
             version = asked
+            if isinstance(error, ObservationError) and _is_stricter(store, request, asked):
+                counted_as = STRICTER
         else:  # an alias counts as its version, no version as the default
             version = store.default(name) if version is None else store.plans[name].version_of(version) or ""
-        self.metrics.count_failure(request.protocol, name, version, counted_as or code)
-        self.log.write_failure(request, code, sentence)
+        self.metrics.count_failure(request.protocol, name, version, counted_as)
+        self.log.write_failure(request, code, error.message)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
         """Count a request that failed with the current exception, and log its traceback."""
@@ -228,16 +227,14 @@ class RequestHandler:
     def open_stream(self, request: Request) -> None:
         """Count a new stream; `request` is its opening request. Raises OverloadedError."""
         try:
-            self.admission.open_stream()
+            self.admission.open_stream(request.policy)
         except OverloadedError as error:
-            self.record_failure(request, error.code, error.message)
+            self.record_failure(request, error)
             raise
-        self.metrics.count_stream(request.policy, 1)
 
     def close_stream(self, request: Request) -> None:
         """Count one stream less."""
-        self.admission.close_stream()
-        self.metrics.count_stream(request.policy, -1)
+        self.admission.streams[request.policy] -= 1
 
     def _count_end(self, request: Request, decision: Decision, status: str) -> None:
         """Count an episode that ended, unless its requests were divided between versions at random."""
@@ -255,22 +252,6 @@ class RequestHandler:
         # Only now that the body is here: a client that sends slowly delays only itself.
         request.received = min(request.received, self.admission.enter())
 
-    def _counted_as(self, request: Request, error: RlservoError) -> str:
-        """Return the code to count for a failure: its own, or STRICTER if the version that was asked is at fault.
-
-        Most observations that a version refuses would be refused by every version, and say nothing about it. One that
-        production accepts does, even if the version's contract demands the refusal.
-        """
-        version, store = blamed_version(error), self._store_provider()
-        if version is None or store is None or not isinstance(error, ObservationError):
-            return error.code
-        with contextlib.suppress(RlservoError):
-            production = store.get(request.policy)
-            if production.contract.version != version:
-                production.parse(request.obs)
-                return STRICTER
-        return error.code
-
     async def _decide_non_finite(self, request: Request) -> Decision:
         """Refuse numbers that JSON lacks, naming the element if it is one of the observation's."""
         if request.episode is NO_EPISODE:  # otherwise a session would advance
@@ -281,9 +262,24 @@ class RequestHandler:
         raise RequestError("the request body holds NaN or Infinity, which JSON does not have: send finite numbers")
 
     def _check_batch(self, store: PolicyStore, request: Request) -> None:
-        rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
-        if rows > self._max_batch:
-            raise TooLargeError(f"a batch of {rows} observations is too large: at most {self._max_batch}")
+        most = self.settings.max_batch
+        with contextlib.suppress(UnknownPolicyError):  # the decision raises it, or that the session has gone with it
+            rows = count_rows(store.get(request.policy, request.version).contract.observation_space, request.obs)
+            if rows > most:
+                raise TooLargeError(f"a batch of {rows} observations is too large: at most {most}")
+
+
+def _is_stricter(store: PolicyStore, request: Request, version: str) -> bool:
+    """Return whether production accepts an observation that a version has refused.
+
+    Most that a version refuses would be refused by every version, and say nothing about it. One that production accepts
+    does, even if the version's contract demands the refusal.
+    """
+    try:
+        production = store.get(request.policy)
+        return production.contract.version != version and bool(production.parse(request.obs))
+    except RlservoError:
+        return False
 
 
 def _check_names(request: Request) -> None:
@@ -294,12 +290,3 @@ def _check_names(request: Request) -> None:
         if type(text) is str and A_KEY.search(text):
             request.label, request.episode = None, NO_EPISODE
             raise RequestError(f"'{name}' holds an API key, which would be recorded: send another name")
-
-
-def _session_store(settings: ServerSettings) -> RedisSessions | None:
-    """Return the session store that several processes share, if one is set. Raises UsageError."""
-    if settings.session_store == MEMORY:
-        return None
-    from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only servers with several workers need it
-
-    return RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=settings.max_queue_ms / 1e3)

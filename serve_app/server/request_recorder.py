@@ -38,6 +38,7 @@ with needs_extra("record", what="recording"):
 
 logger = logging.getLogger(__name__)
 
+LARGEST_FILE = 256 << 20  # [bytes]
 MOST_EPISODES = 65_536  # whose steps are counted; beyond it, the one that was silent longest starts over
 LONGEST_REQUEST_ID = 128  # longer ones are cut: a header may have 16 KB
 
@@ -48,8 +49,9 @@ class RequestRecorder:
     def __init__(self, settings: ServerSettings) -> None:
         """Record into the folder that `settings` name. Raises UsageError if nothing can be written there."""
         assert settings.record is not None
+        file_bytes = min(LARGEST_FILE, settings.record_bytes // 4)
         self.recorder = Recorder(
-            Path(settings.record), max_file_bytes=settings.record_file_bytes, max_folder_bytes=settings.record_bytes
+            Path(settings.record), max_file_bytes=file_bytes, max_folder_bytes=settings.record_bytes
         )
         self._formats: WeakKeyDictionary[Policy, PolicyFormat] = WeakKeyDictionary()
         self._steps: OrderedDict[tuple[str, str], int] = OrderedDict()

@@ -10,16 +10,13 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from typing_extensions import Self
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.runtime.options import PolicyOptions
-
-if TYPE_CHECKING:
-    from rlservo.export.contract.bundle import BundleLimits
 
 PREFIX = "RLSERVO_"
 MEMORY = "memory"  # this process's memory, where sessions are kept by default
@@ -127,20 +124,12 @@ class ServerSettings(BaseModel):
     """Record every decision into this folder, except for policies with the option `"record": false`. Off by default, as
     observations may be private. Also set by `rlservo serve --record`."""
 
-    record_file_bytes: int = Field(256 << 20, ge=1 << 20)
-    """A recording continues in a new file after this size, or after an hour."""
-
-    record_bytes: int = Field(10 << 30, ge=2 << 20)
-    """Beyond this size the oldest recordings in the folder are deleted; at least twice `record_file_bytes`."""
+    record_bytes: int = Field(10 << 30, ge=4 << 20)
+    """Beyond this size the oldest recordings in the folder are deleted. Each has at most 256 MB, and at most a quarter
+    of this."""
 
     max_policy_bytes: int = Field(512 << 20, ge=1024)
     """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
-
-    max_golden_bytes: int = Field(512 << 20, ge=1024)
-    """A larger golden.npz, packed or unpacked, is refused before it is read."""
-
-    max_contract_bytes: int = Field(16 << 20, ge=1024)
-    """A larger contract.json is refused before it is read."""
 
     plan: str | None = None
     """Folder or URI whose `.plan` holds the aliases, canaries and shadows. By default the first policy folder
@@ -160,19 +149,6 @@ class ServerSettings(BaseModel):
     poll_s: float | None = Field(None, ge=1, allow_inf_nan=False)
     """[s] How often to look for new versions of policies and load them, as `rlservo policy load` does: ready but
     not in use. Off by default. Also set by `rlservo serve --poll`."""
-
-    @property
-    def bundle_limits(self) -> BundleLimits:
-        """Size limits of a bundle's files."""
-        from rlservo.export.contract.bundle import (
-            BundleLimits,  # which imports numpy: `rlservo key` reads the settings, too
-        )
-
-        return BundleLimits(
-            max_policy_bytes=self.max_policy_bytes,
-            max_golden_bytes=self.max_golden_bytes,
-            max_contract_bytes=self.max_contract_bytes,
-        )
 
     @field_validator("api_keys_file", "audit_file", "log_file", "record", "cache")
     @classmethod

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from rlservo.export.contract.bundle import BundleLimits
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.runtime.policy import Policy
@@ -25,28 +26,17 @@ def load_served(
 
     Raises UsageError or BundleError, and UnavailableError if a file system or storage does not answer.
     """
-    settings = settings or ServerSettings.from_environment(environment={})
-    control = PlanFollower(version_loader(paths, settings), plan_files(paths, settings))
+    control = PlanFollower(*loader_and_plans(paths, settings or ServerSettings.from_environment(environment={})))
     asyncio.run(control.configure(config.model_dump(exclude_unset=True)))
     if control.store is None:
         raise UnavailableError("no policies were loaded")
     return control.store
 
 
-def version_loader(places: Iterable[str | Path], settings: ServerSettings) -> VersionLoader:
-    """Return the loader for versions of these folders and URIs, under the settings. Raises UsageError."""
-    limits = settings.bundle_limits
+def loader_and_plans(places: Sequence[str | Path], settings: ServerSettings) -> tuple[VersionLoader, PlanFiles]:
+    """Return the loader for versions of these folders and URIs, and the files of their plan. Raises UsageError."""
+    limits, cache, timeout_s = BundleLimits(settings.max_policy_bytes), settings.cache, settings.load_timeout_s
+    repository = Repository(places, limits, cache=cache, cache_bytes=settings.cache_bytes, timeout_s=timeout_s)
     load = partial(Policy.load, threads=settings.threads, limits=limits)
-    repository = Repository(
-        places,
-        limits,
-        cache=settings.cache,
-        cache_bytes=settings.cache_bytes,
-        timeout_s=settings.load_timeout_s,
-    )
-    return VersionLoader(repository, load, options=settings.policy_options, timeout_s=settings.load_timeout_s)
-
-
-def plan_files(places: Sequence[str | Path], settings: ServerSettings) -> PlanFiles:
-    """Return the plan's files for these folders and URIs, under the settings. Raises UsageError."""
-    return PlanFiles(places, root=settings.plan, cache=settings.cache, timeout_s=settings.load_timeout_s)
+    loader = VersionLoader(repository, load, options=settings.policy_options, timeout_s=timeout_s)
+    return loader, PlanFiles(places, root=settings.plan, cache=cache, timeout_s=timeout_s)

@@ -376,14 +376,13 @@ def test_env_arguments_are_json_or_strings() -> None:
 
 
 def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
-    from rlservo.serve_app.server.access_checks import find_key
     from rlservo.serve_app.server.api_keys import Keys, Role
     from rlservo.serve_app.server.settings import ServerSettings
 
     done = rlservo("key", "operator", "--admin", "--json")
     assert done.returncode == 0, done.stderr
     made = json.loads(done.stdout)
-    found = find_key(Keys.from_settings(ServerSettings(api_keys=made["line"])), made["key"].encode())
+    found = Keys.from_settings(ServerSettings(api_keys=made["line"])).find(made["key"].encode())
     assert found is not None and (found.label, found.role) == ("operator", Role.admin)
     plain = rlservo_here("key", "cell-7").stdout.split("\n")
     assert plain[0].startswith("rlservo_") and plain[1].startswith("cell-7 act sha256:")

@@ -517,15 +517,15 @@ def test_no_route_reads_a_body_beyond_the_limit(server: Served) -> None:
             assert status == expected, (method, path, rest[:20])
 
 
-@pytest.mark.parametrize("name", [b"x-request-id", b"x-session-id", b"serve_multiplexed_model_id", b"user-agent"])
-def test_a_header_that_is_not_utf8_is_refused_after_the_key_in_our_form(server: Served, name: bytes) -> None:
+@pytest.mark.parametrize("name", [b"x-request-id", b"x-session-id", b"authorization", b"x-api-key", b"user-agent"])
+def test_a_header_that_is_not_utf8_is_like_any_other(server: Served, name: bytes) -> None:
     with Wire(server.port) as wire:
         for method, path in ((b"GET", b"/v1/policies"), (b"POST", b"/v1/policies/ur5/act"), (b"GET", b"/nowhere")):
-            status, answer = wire.ask(method, path, name + b": caf\xe9")
-            assert status == (401 if server.kind == "keys" else 400), (path, answer)
-            status, answer = wire.ask(method, path, name + b": caf\xe9", *bearer(ADMIN))
-            assert (status, json.loads(answer)["code"]) == (400, "bad-request") and name in answer
-            assert wire.ask(method, path, name + ": café".encode(), *bearer(ADMIN), body=OBS)[0] in (200, 404, 422)
+            for value in (b"caf\xe9", "café".encode(), b"\x80" * 200):
+                given = (b"" if name == b"authorization" else bearer(ADMIN)[0], name + b": " + value)
+                plain = (given[0], name + b": cafe")
+                status, answer = wire.ask(method, path, *filter(None, given), body=OBS)
+                assert status == wire.ask(method, path, *filter(None, plain), body=OBS)[0] != 500, (path, answer)
 
 
 def test_long_paths_that_anyone_may_send_take_no_memory(server: Served) -> None:

@@ -22,7 +22,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.sampled_metrics import exposition
+from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from stores import load_store

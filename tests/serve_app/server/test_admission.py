@@ -20,7 +20,7 @@ def admission_of(max_queue_ms: float) -> Admission:
 def test_what_is_read_after_a_loop_stood_still_is_refused_and_what_comes_later_is_not() -> None:
     async def run() -> None:
         admission = admission_of(300.0)
-        admission.loop_clock.start()
+        admission.start_clock()
         await asyncio.sleep(0.1)
         admission.enter()
         time.sleep(0.5)
@@ -45,7 +45,7 @@ def test_a_loop_that_turns_refuses_nobody() -> None:
     async def run() -> None:
         admission = admission_of(5000.0)
         admission.check_age()  # nor one whose clock does not run
-        admission.loop_clock.start()
+        admission.start_clock()
         for _ in range(10):
             await asyncio.sleep(0.03)
             admission.check_age()

@@ -14,9 +14,8 @@ import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.metrics import Metrics
+from rlservo.serve_app.server.metrics import Metrics, exposition
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import Load, Unload
 from servers import exchange
@@ -114,5 +113,5 @@ def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
 def test_a_counter_whose_source_begins_again_goes_on() -> None:
     metrics = Metrics("r")
     for total in (0, 3, 3, 5, 2, 4):
-        metrics.sampled.counter("rlservo_looks", "Looks", total, policy="ur5")
+        metrics.counter("rlservo_looks", "Looks", total, policy="ur5")
     assert b'rlservo_looks_total{policy="ur5",replica="r"} 9.0' in metrics.text()

@@ -133,7 +133,7 @@ def test_a_websockets_frames_count_and_one_too_many_ends_it_or_not(port: int, ap
         connect()
     assert caught.value.response.status_code == 429
     assert 900 < int(caught.value.response.headers["retry-after"]) <= 1000
-    app.handler.keys.limits._buckets.clear()
+    app.handler.keys.limits._rested_at.clear()
     with connect() as stream:
         stream.recv()
         for _ in range(BURST - 1):
