@@ -123,17 +123,7 @@ _MESSAGES: dict[str, list[str]] = {
 }
 _DATA_TYPES = "INVALID BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP16 FP32 FP64"
 
-UNARY = (
-    "ServerLive",
-    "ServerReady",
-    "ServerMetadata",
-    "ModelReady",
-    "ModelMetadata",
-    "ModelConfig",
-    "ModelStatistics",
-    "ModelInfer",
-    "RepositoryIndex",
-)
+UNARY = tuple(name.removesuffix("Request") for name in _MESSAGES if name.endswith("Request"))
 STREAM = "ModelStreamInfer"
 _METHODS = {name: f"{name}Request {name}Response" for name in UNARY}
 _METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
