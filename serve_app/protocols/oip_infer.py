@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 from weakref import WeakKeyDictionary
 
-import numpy as np
 import orjson
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, SkipValidation, TypeAdapter, with_config
@@ -37,7 +36,7 @@ from rlservo.serve_app.protocols.http_endpoint import (
     receive_body,
 )
 from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers, too_large
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, read_inputs, write_tensor
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, read_inputs, write_tensor
 from rlservo.serve_app.protocols.request_fields import Options, fill_request, parse_fields, parse_json, strict
 from rlservo.serve_app.protocols.routes import POST, Route, of_policy
 from rlservo.serve_app.runtime.policy import Policy
@@ -185,15 +184,12 @@ class OipHttpCodec:
 
     def parse(self, request: Request, content: Body) -> None:
         """Fill the request. Raises RequestError, ObservationError, TooLargeError, UnknownPolicyError."""
-        policy = self._handler.store().get(request.policy, request.version)
+        self._handler.store().get(request.policy, request.version)  # an unknown one is reported first
         length = _parse_length(request.headers.get(LENGTH_HEADER))
         encoding = content_encoding(request.headers, *ENCODINGS)
         if encoding:
             content = _decompress(content, encoding, self._handler.settings.max_body_bytes)
         view = memoryview(content)
-        if length == 0 and len(view):
-            fill(self._handler, request, _document_of_raw(model_of(policy), view), view)
-            return
         if length is not None and length > len(view):
             raise RequestError(f"Inference-Header-Content-Length is {length}, but the body has {len(view)} bytes")
         header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
@@ -280,23 +276,6 @@ def reply_of(request: Request, decision: Decision) -> tuple[dict[str, Any], list
     ]
     reply["outputs"] = [tensor for tensor, _ in written]
     return reply, [part for _, part in written if part is not None]
-
-
-def _document_of_raw(model: Model, view: memoryview) -> dict[str, Any]:
-    """Return the document for a body without JSON: the only input's bytes; their number gives the batch size."""
-    names = [tensor.name for tensor in model.contract.inputs]
-    if len(names) != 1:
-        raise RequestError(f"a body without JSON is for models with one input; this one has {', '.join(names)}")
-    tensor = model.inputs[names[0]]
-    datatype, inner = datatype_of(tensor.dtype), tensor.shape[1:]
-    row = DTYPES[datatype].itemsize * int(np.prod(inner))
-    if len(view) % row:
-        raise ObservationError(
-            f"input '{tensor.name}' takes {row} bytes per observation, but the body has {len(view)}: not a multiple"
-        )
-    parameters = {"binary_data_size": len(view)}
-    shape = [len(view) // row, *inner]
-    return {"inputs": [{"name": tensor.name, "shape": shape, "datatype": datatype, "parameters": parameters}]}
 
 
 def _check_inputs(model: Model, inputs: Mapping[str, NDArray[Any]]) -> None:

@@ -18,19 +18,9 @@ from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.serve_app.protocols.request_fields import json_type
 from rlservo.serve_app.runtime.input_numbers import parse_array
 
+DATATYPES = "BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP16 FP32 FP64"  # in the order of Triton's DataType
 DTYPES: dict[str, np.dtype[Any]] = {
-    "BOOL": np.dtype("?"),
-    "UINT8": np.dtype("u1"),
-    "UINT16": np.dtype("<u2"),
-    "UINT32": np.dtype("<u4"),
-    "UINT64": np.dtype("<u8"),
-    "INT8": np.dtype("i1"),
-    "INT16": np.dtype("<i2"),
-    "INT32": np.dtype("<i4"),
-    "INT64": np.dtype("<i8"),
-    "FP16": np.dtype("<f2"),
-    "FP32": np.dtype("<f4"),
-    "FP64": np.dtype("<f8"),
+    name: np.dtype(name.lower().replace("fp", "float")).newbyteorder("<") for name in DATATYPES.split()
 }
 NAMES = {dtype.newbyteorder("="): name for name, dtype in DTYPES.items()}
 MOST_NUMBERS = 2**59  # numpy counts an array's bytes in 63 bits

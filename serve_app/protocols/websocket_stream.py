@@ -66,15 +66,14 @@ def routes(handler: RequestHandler) -> list[Route]:
     codec = MsgpackCodec(handler)
 
     async def serve(call: Call, send: Send) -> None:
-        headers = call.headers
         opening = Request(
             PROTOCOL,
             "",
             None,
             time.perf_counter(),
-            label=header_text(headers, LABEL),
+            label=header_text(call.headers, LABEL),
             request_id=call.audit.request_id,
-            headers=headers,
+            headers=call.headers,
         )
         try:
             opening.policy, opening.version = _address(handler, call.params)
