@@ -76,9 +76,8 @@ def check_media_type(headers: Mapping[bytes, bytes], *others: bytes, optional: b
 
 def content_encoding(headers: Mapping[bytes, bytes], *accepted: bytes) -> bytes:
     """Return how the body is compressed, b"" if it is not. Raises MediaTypeError if it may not be."""
-    given = headers.get(b"content-encoding", b"")
-    encoding = given.strip().lower()
-    if encoding in (b"", b"identity"):
+    given = headers.get(b"content-encoding")
+    if given is None or (encoding := given.strip().lower()) in (b"", b"identity"):
         return b""
     if encoding not in accepted:
         wanted = " or ".join([*(each.decode() for each in accepted), "plain JSON"])

@@ -238,6 +238,8 @@ def fill(handler: RequestHandler, request: Request, document: Mapping[str, Any],
     )
     _check_inputs(model, inputs)
     request.obs = build_action(model.contract.observation_space, inputs, "obs")
+    if not parameters and len(inputs) == 1:  # the usual request
+        return
     deadlines = (request.deadline_ms, parameters.get("deadline_ms"), (parameters.get("timeout") or 0) / 1e3 or None)
     request.episode = fill_request(
         request,

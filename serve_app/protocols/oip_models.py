@@ -28,7 +28,6 @@ from rlservo.serve_app.protocols.oip_infer import STATE_IN, STATE_OUT, is_option
 from rlservo.serve_app.protocols.oip_tensors import datatype_of
 from rlservo.serve_app.protocols.request_fields import parse_fields, parse_json, strict
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route, of_policy
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
 from rlservo.serve_app.server.listing import states_of
@@ -150,28 +149,24 @@ def model_config(handler: RequestHandler, name: str = "", version: str | None = 
         "model_transaction_policy": {"decoupled": False},  # a request has one reply
     }
     if policy.is_stateful:
-        config["sequence_batching"] = _sequences(handler, policy)
+        config["sequence_batching"] = {
+            "max_sequence_idle_microseconds": round(handler.settings.session_idle_s * 1e6),
+            "state": [
+                {
+                    "input_name": STATE_IN + state.name,
+                    "output_name": STATE_OUT + state.name,
+                    "data_type": f"TYPE_{datatype_of(state.dtype)}",
+                    "dims": list(state.shape),
+                }
+                for state in policy.contract.state
+            ],
+        }
     return config
 
 
 def _tensor(name: str, tensor: TensorSpec) -> dict[str, Any]:
     """Return a tensor in the form of Triton's configuration: without the batch axis."""
     return {"name": name, "data_type": f"TYPE_{datatype_of(tensor.dtype)}", "dims": list(tensor.shape[1:])}
-
-
-def _sequences(handler: RequestHandler, policy: Policy) -> dict[str, Any]:
-    return {
-        "max_sequence_idle_microseconds": round(handler.settings.session_idle_s * 1e6),
-        "state": [
-            {
-                "input_name": STATE_IN + state.name,
-                "output_name": STATE_OUT + state.name,
-                "data_type": f"TYPE_{datatype_of(state.dtype)}",
-                "dims": list(state.shape),
-            }
-            for state in policy.contract.state
-        ],
-    }
 
 
 def statistics(handler: RequestHandler, name: str = "", version: str | None = None) -> dict[str, Any]:
