@@ -335,7 +335,7 @@ def _wanted_outputs(model: Model, given: InferRequest, parameters: Parameters, *
 def _parse_length(value: bytes | None) -> int | None:
     if value is None:
         return None
-    if not value.isdigit() or len(value) > 15:
+    if not value.isdigit() or len(value) > 15 or not int(value):  # Triton's form without JSON is not read
         raise RequestError(
             f"Inference-Header-Content-Length must be the length of the JSON, got '{value[:32].decode('latin-1')}'"
         )

@@ -292,6 +292,7 @@ def test_a_wrong_request_is_told_what_is_wrong(ask: Ask, body: Any, status: int,
     [
         ("9999999", 108, "Inference-Header-Content-Length is 9999999, but the body has"),
         ("-1", 108, "must be the length of the JSON, got '-1'"),
+        ("0", 108, "must be the length of the JSON, got '0'"),
         (None, 104, "needs 108 bytes after the JSON, but the body has 104 left"),
         (None, 112, "the body has 4 bytes after the last tensor's data"),
     ],
