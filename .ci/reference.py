@@ -147,7 +147,8 @@ def error_codes() -> str:
     )
     rows = []
     for kind in kinds(errors.RlservoError):
-        facts = f"`{kind.code}`" if issubclass(kind, NOT_SERVED) else f"`{kind.code}`, {status_of(kind.__new__(kind))}"
+        status, _ = status_of(kind.__new__(kind))
+        facts = f"`{kind.code}`" if issubclass(kind, NOT_SERVED) else f"`{kind.code}`, {status}"
         rows.append(bullet(kind.__name__, facts, one_line(inspect.cleandoc(kind.__doc__ or "").partition("\n\n")[0])))
     text.append("\n".join(rows))
     return "\n\n".join(text) + "\n"

@@ -22,7 +22,7 @@ from ray.serve import Application, Deployment
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.engines.autoscaling import BUSY, Load
 from rlservo.serve_app.engines.serving import Serving
-from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.asgi_app import PolicyApp
 from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY
 from rlservo.serve_app.repository.storage import place_of

@@ -1,190 +1,46 @@
-"""Routing and checks of every connection; body and reply of requests for actions.
-
-Everything runs in the event loop: a decision takes microseconds, a hop to a thread takes more.
-"""
+"""HTTP requests for actions: their headers, their body, and whether their client still waits."""
 
 from __future__ import annotations
 
 import asyncio
-import itertools
-import secrets
 import time
 from collections.abc import Mapping
 from functools import partial
 
-from rlservo.export.contract.errors import (
-    ForbiddenError,
-    InternalError,
-    RateLimitError,
-    RequestError,
-    RlservoError,
-    UnknownPolicyError,
-)
+from rlservo.export.contract.errors import MediaTypeError
 from rlservo.serve_app.episodes.request import ClientGoneError, Request
-from rlservo.serve_app.protocols.http_errors import (
-    Headers,
-    error_answer,
-    missing_route,
-    refuse_upgrade,
-    send_error,
-    send_reply,
-    too_large,
-)
-from rlservo.serve_app.protocols.routes import WEBSOCKET, Answer, Call, Found, RoutingTable
-from rlservo.serve_app.server.access_checks import (
-    HEADERS,
-    LABEL,
-    MAY_EXPLORE,
-    REPLY_HEADERS,
-    REQUEST_ID,
-    OriginChecks,
-    authorize,
-    check_path,
-    fold_headers,
-    header_text,
-    presented_key,
-)
-from rlservo.serve_app.server.api_keys import Access, Key
-from rlservo.serve_app.server.logs import AuditEntry
+from rlservo.serve_app.protocols.http_errors import JSON, Headers, too_large
+from rlservo.serve_app.protocols.routes import Answer, Call
+from rlservo.serve_app.server.access_checks import LABEL, header_text
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
-from rlservo.serve_app.wire.asgi import Receive, Scope, Send
+from rlservo.serve_app.wire.asgi import Receive
 
 HANG_UP_TURNS = 4
+OCTETS = b"application/octet-stream"
 
 Body = bytes | bytearray
 
-PROCESS = secrets.token_hex(8).encode()
-numbers = itertools.count(1)
 
+def act_over_http(protocol: str, codec: Codec[Receive, tuple[bytes, Headers]], handler: RequestHandler) -> Answer:
+    """Return the answer to a protocol's requests for actions; its name is for metrics and logs."""
 
-class PolicyApp:
-    """The ASGI application: finds each connection's route, and checks the client before it reads the body."""
-
-    def __init__(
-        self, handler: RequestHandler, checks: OriginChecks, table: RoutingTable, *, is_behind_serve: bool = False
-    ) -> None:
-        """`is_behind_serve`: Ray Serve adds the request id to replies, and its connections treat trailers as headers"""
-        self.handler = handler
-        self.table = table
-        self._checks = checks
-        self._is_behind_serve = is_behind_serve
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one ASGI connection."""
-        if scope["type"] == "lifespan":  # the engine loads the policies
-            for phase in ("startup", "shutdown"):
-                await receive()
-                await send({"type": f"lifespan.{phase}.complete"})
-            return
-        path, headers = route_path(scope), fold_headers(scope["headers"])
-        request_id = headers.get(REQUEST_ID)
-        if request_id is None:
-            request_id = headers[REQUEST_ID] = b"%s-%x" % (PROCESS, next(numbers))
-        scope[HEADERS] = headers
-        scope[REPLY_HEADERS] = () if self._is_behind_serve else ((REQUEST_ID, request_id),)
-        method = scope["method"] if scope["type"] == "http" else WEBSOCKET
-        found = self.table.find(method, path, headers.get(b"accept", b""))
-        if found.route is None or found.route.app is None:
-            await self._answer(found, path, scope, receive, send)
-            return
-        try:
-            key = self._check(found, path, scope)
-        except RlservoError as error:
-            await self._refuse(scope, receive, send, error)
-            return
-        scope["path_params"] = found.params
-        scope[MAY_EXPLORE] = key is None or key.may_explore
-        await found.route.app(scope, receive, send)
-
-    async def _answer(self, found: Found, path: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer if there is no route, or one that takes the whole body."""
-        headers = scope[HEADERS]
-        entry = AuditEntry(scope.get("method", ""), path, peer_of(scope), header_text(headers, REQUEST_ID))
-        own: Headers
-        try:
-            key = self._check(found, path, scope)
-            entry.key = "" if key is None else key.label
-            if scope["type"] == "websocket":
-                raise UnknownPolicyError(f"there is no stream at {path[:200]}: connect to /v1/policies/NAME/stream")
-            if found.route is None or found.route.answer is None:
-                status, entry.code, content, own = missing_route(entry.method, path, found.allowed)
-            else:
-                body = await receive_body(self.handler, headers, receive)
-                call = Call(found.params, headers, bytes(body), entry)
-                status, content, own = await _reply_of(found.route.answer, call)
-            await send_reply(send, status, content, own + scope[REPLY_HEADERS])
-        except RlservoError as error:
-            entry.code = error.code
-            if isinstance(error, ForbiddenError | RateLimitError):
-                entry.key = entry.key or error.key
-            await self._refuse(scope, receive, send, error)
-        except ClientGoneError:
-            return
-        finally:
-            if found.access is Access.admin:
-                entry.write()
-
-    def _check(self, found: Found, path: str, scope: Scope) -> Key | None:
-        """Return the key that permits a route. Raises what `check_path`, `OriginChecks.check` and `authorize` raise."""
-        check_path(scope, path)
-        self._checks.check(scope, scope[HEADERS])
-        key = authorize(self.handler.keys, presented_key(scope[HEADERS]), found.access)
-        if self._is_behind_serve and b"transfer-encoding" in scope[HEADERS]:
-            raise RequestError("a chunked body is not accepted behind Ray Serve: send Content-Length")
-        return key
-
-    async def _refuse(self, scope: Scope, receive: Receive, send: Send, error: RlservoError) -> None:
-        headers, own = scope[HEADERS], scope[REPLY_HEADERS]
-        request = Request(scope["type"], "", None, time.perf_counter(), peer=peer_of(scope))
-        request.request_id = header_text(headers, REQUEST_ID)
-        self.handler.record_failure(request, error)
-        if scope["type"] == "http":
-            await send_error(send, error, headers=own)
-        else:
-            await refuse_upgrade(scope, receive, send, error, own)
-
-
-async def _reply_of(answer: Answer, call: Call) -> tuple[int, bytes, Headers]:
-    """Return (status, body, headers), errors included."""
-    try:
-        return 200, *await answer(call)
-    except Exception as error:
-        call.audit.code = error.code if isinstance(error, RlservoError) else InternalError.code
-        return error_answer(error)
-
-
-class HttpEndpoint:
-    """Answers the POST requests of one protocol."""
-
-    def __init__(self, protocol: str, codec: Codec[Receive, tuple[bytes, Headers]], handler: RequestHandler) -> None:
-        """Take the protocol's name for metrics and logs."""
-        self._protocol = protocol
-        self._codec = codec
-        self._handler = handler
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request, errors included."""
-        headers, params = scope[HEADERS], scope["path_params"]
+    async def answer(call: Call) -> tuple[bytes, Headers]:
+        client = call.scope.get("client")
         request = Request(
-            self._protocol,
-            params["name"],
-            params.get("version"),
+            protocol,
+            call.params["name"],
+            call.params.get("version"),
             time.perf_counter(),
-            label=header_text(headers, LABEL),
-            request_id=header_text(headers, REQUEST_ID),
-            headers=headers,
-            connection=client if (client := scope.get("client")) is not None and client[1] else None,  # 0: a proxy
-            has_hung_up=partial(has_hung_up, receive),
-            may_explore=scope[MAY_EXPLORE],
+            label=header_text(call.headers, LABEL),
+            request_id=call.audit.request_id,
+            headers=call.headers,
+            connection=client if client is not None and client[1] else None,  # 0: a proxy
+            has_hung_up=partial(has_hung_up, call.receive),
+            may_explore=call.may_explore,
         )
-        status = 200
-        try:
-            content, reply_headers = await self._handler.answer(self._codec, request, receive)
-        except RlservoError as error:
-            status, content, reply_headers = error_answer(error)
-        except ClientGoneError:
-            return
-        await send_reply(send, status, content, reply_headers + scope[REPLY_HEADERS])
+        return await handler.answer(codec, request, call.receive)
+
+    return answer
 
 
 async def has_hung_up(receive: Receive) -> bool:
@@ -199,6 +55,34 @@ async def has_hung_up(receive: Receive) -> bool:
         message.cancel()
         return False
     return bool(message.result()["type"] == "http.disconnect")
+
+
+def check_media_type(headers: Mapping[bytes, bytes], *others: bytes, optional: bool = False) -> None:
+    """Raise MediaTypeError unless the body is JSON, or of one of the `others`.
+
+    A web page can send forms, plain text and bodies of no type to any server; for other types a browser asks the server
+    first. Triton's client names no type: `optional` accepts that, except from a browser.
+    """
+    given = headers.get(b"content-type")
+    if given == JSON:
+        return
+    usage = f"send {JSON.decode()} (curl: -H 'content-type: {JSON.decode()}')"
+    if given is None:
+        if not optional or b"origin" in headers or b"sec-fetch-site" in headers:
+            raise MediaTypeError(f"the request has no content type: {usage}")
+    elif given.split(b";", 1)[0].strip().lower() not in (JSON, *others):
+        raise MediaTypeError(f"the content type is '{given[:64].decode('latin-1')}': {usage}")
+
+
+def content_encoding(headers: Mapping[bytes, bytes], *accepted: bytes) -> bytes:
+    """Return how the body is compressed, b"" if it is not. Raises MediaTypeError if it may not be."""
+    given = headers.get(b"content-encoding")
+    if given is None or (encoding := given.strip().lower()) in (b"", b"identity"):
+        return b""
+    if encoding not in accepted:
+        wanted = " or ".join([*(each.decode() for each in accepted), "plain JSON"])
+        raise MediaTypeError(f"the content encoding '{given[:32].decode('latin-1')}' is not supported: send {wanted}")
+    return encoding
 
 
 async def receive_body(handler: RequestHandler, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
@@ -224,17 +108,3 @@ async def receive_body(handler: RequestHandler, headers: Mapping[bytes, bytes], 
     if len(body) > max_bytes:
         raise too_large(max_bytes)
     return body
-
-
-def route_path(scope: Scope) -> str:
-    """Return a connection's path below the prefix that the application is mounted at, as Starlette's routes see it."""
-    path: str = scope["path"]
-    root: str = scope.get("root_path", "")
-    below = path[len(root) :]
-    return below if path.startswith(root) and below[:1] in ("", "/") else path
-
-
-def peer_of(scope: Scope) -> str | None:
-    """Return the client's address; behind trusted proxies uvicorn takes it from `X-Forwarded-For`."""
-    client = scope.get("client")
-    return None if client is None else str(client[0])

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+import numpy as np
 import orjson
 
 from rlservo.export.contract.contract import contract_json
-from rlservo.export.contract.errors import MediaTypeError, ObservationError
+from rlservo.export.contract.errors import ObservationError
 from rlservo.serve_app.episodes.request import Request, reply_fields
-from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
-from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type
-from rlservo.serve_app.protocols.json_text import encode_json, parse_json
-from rlservo.serve_app.protocols.request_fields import ACT, fill_request, parse_fields
+from rlservo.serve_app.protocols.http_endpoint import (
+    Body,
+    act_over_http,
+    check_media_type,
+    content_encoding,
+    receive_body,
+)
+from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers
+from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields, parse_json
 from rlservo.serve_app.protocols.routes import GET, POST, Call, Route, of_policy
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access
@@ -34,11 +38,11 @@ def routes(handler: RequestHandler) -> list[Route]:
         policy = handler.store().get(call.params["name"], call.params.get("version"))
         return contract_json(policy.contract).encode(), JSON_HEADERS
 
-    act = HttpEndpoint("json", JsonCodec(handler), handler)
+    act = act_over_http("json", JsonCodec(handler), handler)
     return [
-        *of_policy(POST, "/v1/policies", "/act", "Act", app=act),
+        *of_policy(POST, "/v1/policies", "/act", "Act", act, reads_body=True),
         Route(GET, "/v1/policies", Access.act, "Policies and versions served", policies),
-        *of_policy(GET, "/v1/policies", "", "Contract", answer=contract),
+        *of_policy(GET, "/v1/policies", "", "Contract", contract),
     ]
 
 
@@ -50,15 +54,9 @@ class JsonCodec:
 
     async def receive(self, request: Request, source: Receive) -> Body:
         """Return the body. Raises MediaTypeError, and what `receive_body` raises."""
-        headers = request.headers
-        if headers.get(b"content-type") != JSON:
-            check_media_type(headers, JSON)
-        encoding = headers.get(b"content-encoding")
-        if encoding is not None and encoding.lower() != b"identity":
-            raise MediaTypeError(
-                f"the content encoding '{encoding[:32].decode('latin-1')}' is not supported: send plain JSON"
-            )
-        return await receive_body(self._handler, headers, source)
+        check_media_type(request.headers)
+        content_encoding(request.headers)
+        return await receive_body(self._handler, request.headers, source)
 
     def parse(self, request: Request, content: Body) -> None:
         """Fill the request; the policy checks the observation itself.
@@ -68,12 +66,7 @@ class JsonCodec:
         """
         if len(content) > SMALL:
             check_json(self._handler.store(), request.policy, content, self._handler.settings.max_batch)
-        try:
-            document = orjson.loads(content)
-        except orjson.JSONDecodeError:
-            document = None
-        if type(document) is not dict:
-            document, request.non_finite = parse_json(content, such_as=SUCH_AS)
+        document, request.non_finite = parse_json(content, such_as=SUCH_AS)
         if len(document) > 1 or "obs" not in document:  # not the usual request
             request.episode = fill_request(request, parse_fields(ACT, document))
             if "obs" not in document:
@@ -82,18 +75,6 @@ class JsonCodec:
 
     def encode(self, request: Request, decision: Decision) -> tuple[bytes, Headers]:
         """Return the reply's body and headers."""
-        fields = {"action": _plain(decision.action), **reply_fields(request, decision)}
-        if "state" in fields:
-            fields["state"] = _plain(fields["state"])
-        return orjson.dumps(fields, option=orjson.OPT_SERIALIZE_NUMPY), JSON_HEADERS
-
-
-def _plain(action: Any) -> Any:
-    """Return an action or a state in a form for orjson, which rejects 0-d arrays."""
-    if isinstance(action, dict):
-        return {key: _plain(part) for key, part in action.items()}
-    if isinstance(action, tuple):
-        return [_plain(part) for part in action]
-    if isinstance(action, str):  # the policy that a state belongs to
-        return action
-    return action if action.ndim else action.item()
+        fields = {"action": decision.action, **reply_fields(request, decision)}
+        # orjson leaves arrays without an axis, of discrete actions, to `default`.
+        return orjson.dumps(fields, default=np.ndarray.tolist, option=orjson.OPT_SERIALIZE_NUMPY), JSON_HEADERS

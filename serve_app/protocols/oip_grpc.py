@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import ipaddress
 import secrets
 import time
 from collections.abc import AsyncIterator, Mapping, Sequence
@@ -34,8 +33,9 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols import oip_infer, oip_models
+from rlservo.serve_app.protocols import oip_models
 from rlservo.serve_app.protocols.http_errors import describe
+from rlservo.serve_app.protocols.oip_infer import ReplyOptions, fill, reply_of
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of
 from rlservo.serve_app.server.access_checks import LABEL, StreamKey, authorize, header_text, presented_key
@@ -43,26 +43,13 @@ from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.addresses import is_loopback
 
 Incoming = tuple[bytes, float | None]
 """A request's bytes, and the seconds for which its caller still waits (None: indefinitely)."""
 
 PROTOCOL = "grpc"
 REQUEST_ID = "x-request-id"
-CODES = {
-    400: grpc.StatusCode.INVALID_ARGUMENT,
-    401: grpc.StatusCode.UNAUTHENTICATED,
-    403: grpc.StatusCode.PERMISSION_DENIED,
-    404: grpc.StatusCode.NOT_FOUND,
-    408: grpc.StatusCode.DEADLINE_EXCEEDED,
-    409: grpc.StatusCode.FAILED_PRECONDITION,
-    410: grpc.StatusCode.FAILED_PRECONDITION,
-    413: grpc.StatusCode.RESOURCE_EXHAUSTED,  # gRPC's own status for a message beyond its limit
-    415: grpc.StatusCode.INVALID_ARGUMENT,
-    422: grpc.StatusCode.INVALID_ARGUMENT,
-    429: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    503: grpc.StatusCode.UNAVAILABLE,
-}
 # The field of InferTensorContents that holds a datatype; FP16 has none and is sent raw.
 FIELDS = {
     "BOOL": "bool_contents",
@@ -73,6 +60,8 @@ FIELDS = {
     "FP32": "fp32_contents",
     "FP64": "fp64_contents",
 }
+# The field of InferParameter that holds a value.
+PARAMETER = {bool: "bool_param", int: "int64_param", float: "double_param", str: "string_param"}
 
 
 class Grpc:
@@ -100,19 +89,14 @@ class Grpc:
     def _look_up(self, name: str, content: bytes) -> Any:
         """Return the reply to a method without an action."""
         asked, reply = _parse(getattr(messages, f"{name}Request"), content), getattr(messages, f"{name}Response")()
-        if name == "RepositoryIndex":
-            document: Any = {"models": oip_models.repository_index(self._handler, ready=asked.ready)}
-        else:
-            method = oip_models.METHODS[name]
-            try:
-                document = method.document(
-                    self._handler, getattr(asked, "name", ""), getattr(asked, "version", "") or None
-                )
-            except (UnavailableError, UnknownPolicyError):
-                if name not in ("ServerReady", "ModelReady"):
-                    raise
-                document = {"ready": False}
-            document = {method.field: document} if method.field else document
+        method = oip_models.METHODS[name]
+        try:
+            document = method.document(self._handler, **{field.name: value for field, value in asked.ListFields()})
+        except (UnavailableError, UnknownPolicyError):
+            if name not in ("ServerReady", "ModelReady"):
+                raise
+            document = {"ready": False}
+        document = {method.field: document} if method.field else document
         return json_format.Parse(orjson.dumps(document), reply, ignore_unknown_fields=name == "ModelReady")
 
     async def stream(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[Any]:
@@ -206,36 +190,25 @@ class OipGrpcCodec:
             if len(getattr(message, field)) > SPARE:
                 raise TooLargeError(f"the message has more than {SPARE} {field}")
         document, raw = _document_of(message)
-        oip_infer.fill(self._handler, request, document, memoryview(b"".join(raw)))
+        fill(self._handler, request, document, memoryview(b"".join(raw)))
         # A reply is bytes altogether or typed fields altogether, and not every type has a field.
-        options = request.reply_options
-        outputs = oip_infer.offered_outputs(options.contract)
-        options.binary = bool(raw) or any(datatype_of(tensor.dtype) not in FIELDS for tensor in outputs)
-        options.outputs = dict.fromkeys(options.outputs, options.binary)
+        options: ReplyOptions = request.reply_options
+        binary = bool(raw) or any(datatype_of(tensor.dtype) not in FIELDS for tensor in options.model.outputs.values())
+        options.outputs = dict.fromkeys(options.outputs, binary)
 
     def encode(self, request: Request, decision: Decision) -> Any:
         """Return the reply's message."""
-        document, raw = oip_infer.reply_of(request, decision)
+        document, raw = reply_of(request, decision)
         parameters, outputs = document.pop("parameters"), document.pop("outputs")
         reply = messages.ModelInferResponse(**document, raw_output_contents=raw)
         for name, value in parameters.items():
-            _set(reply.parameters[name], value)
+            kind = "uint64_param" if type(value) is int and value >= 2**63 else PARAMETER[type(value)]
+            setattr(reply.parameters[name], kind, value)
         for tensor in outputs:
             output = reply.outputs.add(name=tensor["name"], datatype=tensor["datatype"], shape=tensor["shape"])
             if "data" in tensor:
                 getattr(output.contents, FIELDS[tensor["datatype"]]).extend(tensor["data"].tolist())
         return reply
-
-
-def _set(parameter: Any, value: Any) -> None:
-    if isinstance(value, bool):
-        parameter.bool_param = value
-    elif isinstance(value, int):
-        setattr(parameter, "int64_param" if value < 2**63 else "uint64_param", value)
-    elif isinstance(value, float):
-        parameter.double_param = value
-    else:
-        parameter.string_param = str(value)
 
 
 def _document_of(message: Any) -> tuple[dict[str, Any], Sequence[bytes]]:
@@ -286,8 +259,8 @@ def _error_reply(error: RlservoError, content: bytes) -> Any:
 
 def _fail(context: Any, error: Exception) -> None:
     """Set the status of a call. Serve would log an exception with its traceback, too much for a client's fault."""
-    status, document, wait_s = describe(error)
-    context.set_code(CODES.get(status, grpc.StatusCode.INTERNAL))
+    (_, status), document, wait_s = describe(error)
+    context.set_code(grpc.StatusCode[status])
     context.set_details(document["error"])
     given = [(name, value) for name, value in context.invocation_metadata() or () if name == REQUEST_ID]
     retry = [] if wait_s is None else [("retry-after", str(wait_s))]
@@ -298,11 +271,5 @@ def _fail(context: Any, error: Exception) -> None:
 def is_local(peer: str) -> bool:
     """Whether a gRPC peer ('ipv4:127.0.0.1:4711', 'ipv6:%5B::1%5D:4711', 'unix:...') is on this machine."""
     scheme, _, address = peer.partition(":")
-    if scheme == "unix":
-        return True
-    try:
-        host = ipaddress.ip_address(unquote(address).rsplit(":", 1)[0].strip("[]"))
-    except ValueError:
-        return False
-    mapped = getattr(host, "ipv4_mapped", None)
-    return host.is_loopback if mapped is None else bool(mapped.is_loopback)
+    host = unquote(address).rpartition(":")[0].strip("[]").removeprefix("::ffff:")
+    return scheme == "unix" or (host != "localhost" and is_loopback(host))  # a name proves nothing

@@ -14,24 +14,30 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Annotated, Any
+from weakref import WeakKeyDictionary
 
-import numpy as np
 import orjson
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, SkipValidation, TypeAdapter, with_config
 from typing_extensions import Required, TypedDict
 
-from rlservo.export.contract.contract import REWARD, Contract, TensorSpec
-from rlservo.export.contract.errors import MediaTypeError, ObservationError, RequestError, quoted
+from rlservo.export.contract.contract import REWARD
+from rlservo.export.contract.errors import ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, NO_EPISODE, Episode, Request, reply_fields
-from rlservo.serve_app.protocols.http_endpoint import Body, HttpEndpoint, receive_body
-from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type, too_large
-from rlservo.serve_app.protocols.json_text import parse_json
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of, read_inputs, write_tensor
-from rlservo.serve_app.protocols.request_fields import Options, fill_request, parse_fields, strict
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, Request, reply_fields
+from rlservo.serve_app.protocols.http_endpoint import (
+    OCTETS,
+    Body,
+    act_over_http,
+    check_media_type,
+    content_encoding,
+    receive_body,
+)
+from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers, too_large
+from rlservo.serve_app.protocols.oip_tensors import DTYPES, read_inputs, write_tensor
+from rlservo.serve_app.protocols.request_fields import Options, fill_request, parse_fields, parse_json, strict
 from rlservo.serve_app.protocols.routes import POST, Route, of_policy
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
@@ -41,10 +47,10 @@ from rlservo.serve_app.wire.asgi import Receive
 from rlservo.serve_app.wire.request_names import BELONGS_TO
 
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
-BINARY = b"application/octet-stream"
 STATE_IN, STATE_OUT = "state_in.", "state_out."
 LAST_ACTION = "last_action"  # inputs named like the outputs `action` and `action.<path>`
-MOST_DIMENSIONS = 32
+MOST_DIMENSIONS = 32  # numpy itself stops at 64
+ENCODINGS = {b"gzip": zlib.MAX_WBITS | 16, b"deflate": zlib.MAX_WBITS}  # and zlib's `wbits`
 SMALLEST_COMPRESSED = 1024  # [bytes] a shorter reply fits into one packet anyway
 COMPRESSION_LEVEL = 1  # a robot's numbers hardly compress, and a control loop waits for them
 SUCH_AS = '{"inputs": [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": [...]}]}'
@@ -108,19 +114,55 @@ PARAMETERS: TypeAdapter[Parameters] = TypeAdapter(Parameters)
 
 def routes(handler: RequestHandler) -> list[Route]:
     """Return the routes of /v2 for actions."""
-    infer = HttpEndpoint("oip", OipHttpCodec(handler), handler)
-    return of_policy(POST, "/v2/models", "/infer", "Infer", app=infer)
+    infer = act_over_http("oip", OipHttpCodec(handler), handler)
+    return of_policy(POST, "/v2/models", "/infer", "Infer", infer, reads_body=True)
+
+
+class Model:
+    """The tensors that this protocol has for a policy, by name."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.contract = policy.contract
+        self.outputs = {
+            tensor.name: tensor
+            for tensor in self.contract.outputs
+            if tensor.name == "action" or tensor.name.startswith(("action.", STATE_OUT))
+        }
+        """Actions and states, not the network's internal values."""
+        last_action = {
+            LAST_ACTION + name.removeprefix("action"): tensor
+            for name, tensor in self.outputs.items()
+            if not name.startswith(STATE_OUT)
+        }
+        own = {tensor.name: tensor for tensor in self.contract.inputs}
+        self.inputs = own | last_action
+        """Those that a request may have: a last action may also be sent for recordings."""
+        self.offered = self.inputs if policy.has_step_limit else own
+
+
+_models: WeakKeyDictionary[Policy, Model] = WeakKeyDictionary()
+
+
+def model_of(policy: Policy) -> Model:
+    """Return a policy's tensors."""
+    model = _models.get(policy)
+    if model is None:
+        model = _models[policy] = Model(policy)
+    return model
+
+
+def is_optional(name: str) -> bool:
+    """Return whether a request may lack this input, as at an episode's start."""
+    return name == REWARD or name.startswith((STATE_IN, LAST_ACTION))
 
 
 @dataclass(slots=True)
 class ReplyOptions:
     """Form of a request's reply."""
 
-    contract: Contract
-    binary: bool
-    """Whether outputs are bytes unless the request specifies each."""
+    model: Model
     outputs: dict[str, bool]
-    """The requested outputs, in order, and whether as bytes; empty means all."""
+    """The outputs, in order, and whether as bytes."""
     request_id: str | None
     """The protocol's own `id`, echoed."""
 
@@ -136,25 +178,18 @@ class OipHttpCodec:
 
         Triton's client sends no content type, others send JSON or octets: the length header distinguishes them.
         """
-        check_media_type(request.headers, JSON, BINARY, optional=True)
-        encoding = request.headers.get(b"content-encoding", b"")
-        if encoding.strip().lower() not in (b"identity", b"gzip", b"deflate", b""):
-            raise MediaTypeError(
-                f"the content encoding '{encoding[:32].decode('latin-1')}' is not supported: send gzip, deflate or none"
-            )
+        check_media_type(request.headers, OCTETS, optional=True)
+        content_encoding(request.headers, *ENCODINGS)
         return await receive_body(self._handler, request.headers, source)
 
     def parse(self, request: Request, content: Body) -> None:
         """Fill the request. Raises RequestError, ObservationError, TooLargeError, UnknownPolicyError."""
-        contract = self._handler.store().get(request.policy, request.version).contract
+        self._handler.store().get(request.policy, request.version)  # an unknown one is reported first
         length = _parse_length(request.headers.get(LENGTH_HEADER))
-        encoding = request.headers.get(b"content-encoding", b"").strip().lower()
-        if encoding not in (b"", b"identity"):
+        encoding = content_encoding(request.headers, *ENCODINGS)
+        if encoding:
             content = _decompress(content, encoding, self._handler.settings.max_body_bytes)
         view = memoryview(content)
-        if length == 0 and len(view):
-            fill(self._handler, request, _document_of_raw(contract, view), view)
-            return
         if length is not None and length > len(view):
             raise RequestError(f"Inference-Header-Content-Length is {length}, but the body has {len(view)} bytes")
         header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
@@ -169,7 +204,7 @@ class OipHttpCodec:
         content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
         headers = JSON_HEADERS
         if parts:
-            headers = ((b"content-type", BINARY), (LENGTH_HEADER, b"%d" % len(content)))
+            headers = ((b"content-type", OCTETS), (LENGTH_HEADER, b"%d" % len(content)))
             content += b"".join(parts)
         accepted = request.headers.get(b"accept-encoding")
         if accepted is not None and len(content) >= SMALLEST_COMPRESSED:
@@ -189,21 +224,36 @@ def fill(handler: RequestHandler, request: Request, document: Mapping[str, Any],
         raise RequestError(f"'inputs' must hold at least one tensor: send {SUCH_AS}")
     inputs = read_inputs(given["inputs"], raw)
     parameters: Parameters = parse_fields(PARAMETERS, given.get("parameters") or {}, "parameter")
-    timeout_us, transport_ms = parameters.get("timeout"), request.deadline_ms
-    request.deadline_ms = timeout_us / 1e3 if timeout_us else None
-    outcome = fill_request(request, parameters)
-    if transport_ms is not None:
-        request.deadline_ms = transport_ms if request.deadline_ms is None else min(request.deadline_ms, transport_ms)
-    sequence = parameters.get("sequence_id") or None
-    identity = parameters.get("state_policy") if any(name.startswith(STATE_IN) for name in inputs) else None
+    states: dict[str, Any] = {
+        name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
+    }
+    identity = parameters.get("state_policy") if states else None
+    if identity is not None:
+        states[BELONGS_TO] = identity
+    sequence, starts = parameters.get("sequence_id") or None, bool(parameters.get("sequence_start"))
     # The policy of the session, or of the state with that identity, even if the default has changed.
-    policy = handler.episodes.policy_of(handler.store(), request.policy, request.version, sequence, identity)
-    contract, binary = policy.contract, bool(parameters.get("binary_data_output"))
-    outputs = _wanted_outputs(contract, given, sequenced=sequence is not None, binary=binary)
-    request.reply_options = ReplyOptions(contract, binary, outputs, given.get("id"))
-    request.obs = _observation(contract, inputs)
-    if parameters or len(inputs) > 1:
-        request.episode = _episode(contract, inputs, parameters, outcome)
+    model = model_of(handler.episodes.policy_of(handler.store(), request.policy, request.version, sequence, identity))
+    request.reply_options = ReplyOptions(
+        model, _wanted_outputs(model, given, parameters, sequenced=sequence is not None), given.get("id")
+    )
+    _check_inputs(model, inputs)
+    request.obs = build_action(model.contract.observation_space, inputs, "obs")
+    if not parameters and len(inputs) == 1:  # the usual request
+        return
+    deadlines = (request.deadline_ms, parameters.get("deadline_ms"), (parameters.get("timeout") or 0) / 1e3 or None)
+    request.episode = fill_request(
+        request,
+        {
+            **parameters,
+            "deadline_ms": min((each for each in deadlines if each is not None), default=None),
+            "state": states or ({} if starts and sequence is None else None),  # a client that will carry it
+            "session_id": sequence,
+            "reset": (starts and sequence is not None) or None,
+            "end": (parameters.get("sequence_end") and sequence is not None) or None,
+            "reward": inputs.get(REWARD, parameters.get("reward")),
+            "last_action": _last_action(model, inputs),
+        },
+    )
 
 
 def reply_of(request: Request, decision: Decision) -> tuple[dict[str, Any], list[bytes]]:
@@ -211,131 +261,67 @@ def reply_of(request: Request, decision: Decision) -> tuple[dict[str, Any], list
     options: ReplyOptions = request.reply_options
     fields = reply_fields(request, decision)
     reply: dict[str, Any] = {"model_name": fields.pop("policy"), "model_version": fields.pop("version")}
+    outputs: dict[str, NDArray[Any]] = action_leaves(options.model.contract.action_space, decision.action)
     if "warnings" in fields:
         fields["warnings"] = "; ".join(fields["warnings"])
     if "session_id" in fields:
         fields["sequence_id"] = fields.pop("session_id")
     if "state" in fields:
-        fields["state_policy"] = fields.pop("state")[BELONGS_TO]
+        carried = fields.pop("state")
+        fields["state_policy"] = carried[BELONGS_TO]
+        outputs.update({STATE_OUT + state.name: carried[state.name] for state in options.model.contract.state})
     reply["parameters"] = fields
     if options.request_id is not None:
         reply["id"] = options.request_id
-    outputs = _outputs(options.contract, decision)
-    binary = options.outputs or dict.fromkeys(outputs, options.binary)
-    written = [write_tensor(name, outputs[name], binary=as_bytes) for name, as_bytes in binary.items()]
+    written = [
+        write_tensor(name, outputs[name], binary=binary) for name, binary in options.outputs.items() if name in outputs
+    ]
     reply["outputs"] = [tensor for tensor, _ in written]
     return reply, [part for _, part in written if part is not None]
 
 
-def _outputs(contract: Contract, decision: Decision) -> dict[str, NDArray[Any]]:
-    """Return all outputs of the model, by tensor name."""
-    outputs: dict[str, NDArray[Any]] = action_leaves(contract.action_space, decision.action)
-    if decision.episode is not None and decision.episode.state is not None:
-        carried = decision.episode.state
-        outputs.update({STATE_OUT + state.name: carried[state.name] for state in contract.state})
-    return outputs
-
-
-def _document_of_raw(contract: Contract, view: memoryview) -> dict[str, Any]:
-    """Return the document for a body without JSON: the only input's bytes; their number gives the batch size."""
-    if len(contract.inputs) != 1:
-        names = ", ".join(tensor.name for tensor in contract.inputs)
-        raise RequestError(f"a body without JSON is for models with one input; this one has {names}")
-    tensor = contract.inputs[0]
-    datatype, inner = datatype_of(tensor.dtype), tensor.shape[1:]
-    row = DTYPES[datatype].itemsize * int(np.prod(inner))
-    if len(view) % row:
-        raise ObservationError(
-            f"input '{tensor.name}' takes {row} bytes per observation, but the body has {len(view)}: not a multiple"
-        )
-    parameters = {"binary_data_size": len(view)}
-    shape = [len(view) // row, *inner]
-    return {"inputs": [{"name": tensor.name, "shape": shape, "datatype": datatype, "parameters": parameters}]}
-
-
-def _observation(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
-    """Return the policy's observation batch out of the named inputs, whose names and shapes are checked."""
-    listed = [*contract.inputs]
-    known = [tensor.name for tensor in listed]
-    unknown = next((name for name in inputs if name not in known), None)
-    if unknown is not None:  # a last action, which is an input that the contract does not list, or a mistake
-        listed += last_action_inputs(contract)
-        unknown = next((name for name in inputs if all(name != tensor.name for tensor in listed)), None)
-    if unknown is not None:
-        raise ObservationError(f"policy '{contract.name}' has no input '{unknown[:64]}': expected {quoted(known)}")
-    rows: dict[str, int] = {}
-    for expected in listed:
-        array = inputs.get(expected.name)
-        if array is None:
-            if expected.name == REWARD or expected.name.startswith((STATE_IN, LAST_ACTION)):
-                continue
-            raise ObservationError(f"policy '{contract.name}' needs the input '{expected.name}', which is missing")
+def _check_inputs(model: Model, inputs: Mapping[str, NDArray[Any]]) -> None:
+    """Raise ObservationError unless the inputs are the model's, of its shapes, and of one batch."""
+    whose = f"policy '{model.contract.name}'"
+    for name, array in inputs.items():
+        expected = model.inputs.get(name)
+        if expected is None:
+            raise ObservationError(f"{whose} has no input '{name[:64]}': expected {quoted(model.offered)}")
         if array.shape[1:] != expected.shape[1:] or array.ndim != len(expected.shape):
             raise ObservationError(
-                f"policy '{contract.name}' expects input '{expected.name}' of shape {list(expected.shape)} "
-                f"(-1 is the batch), got {list(array.shape)}",
-                {"policy": contract.name, "expected_shape": list(expected.shape), "shape": list(array.shape)},
+                f"{whose} expects input '{name}' of shape {list(expected.shape)} (-1 is the batch), got "
+                f"{list(array.shape)}",
+                {"policy": model.contract.name, "expected_shape": list(expected.shape), "shape": list(array.shape)},
             )
-        rows[expected.name] = len(array)
-    if len(set(rows.values())) > 1:
-        batches = ", ".join(f"{name} {count}" for name, count in rows.items())
-        raise ObservationError(f"the inputs of policy '{contract.name}' have different batch sizes: {batches}")
-    return build_action(contract.observation_space, inputs, "obs")
-
-
-def _episode(
-    contract: Contract, inputs: Mapping[str, NDArray[Any]], parameters: Parameters, outcome: Episode
-) -> Episode:
-    """Return the episode fields of the inputs and parameters."""
-    states: dict[str, Any] = {
-        name.removeprefix(STATE_IN): array for name, array in inputs.items() if name.startswith(STATE_IN)
-    }
-    if states and (belongs_to := parameters.get("state_policy")) is not None:
-        states[BELONGS_TO] = belongs_to
-    sequence, starts = parameters.get("sequence_id") or None, bool(parameters.get("sequence_start"))
-    episode = replace(
-        outcome,
-        state={} if starts and not states and sequence is None else states or None,  # a client that will carry it
-        session_id=sequence,
-        reset=starts and sequence is not None,
-        end=bool(parameters.get("sequence_end")) and sequence is not None,
-        reward=inputs.get(REWARD, outcome.reward),
-        last_action=_last_action(contract, inputs),
-    )
-    return NO_EPISODE if all(getattr(episode, field.name) is field.default for field in fields(Episode)) else episode
-
-
-def _last_action(contract: Contract, inputs: Mapping[str, NDArray[Any]]) -> Any:
-    """Return the last action that the inputs hold, in the action space's form, or None. Raises ObservationError."""
-    given = {name: array for name, array in inputs.items() if name.startswith(LAST_ACTION)}
-    if not given:
-        return None
-    missing = next((tensor.name for tensor in last_action_inputs(contract) if tensor.name not in given), None)
+    missing = next((name for name in model.inputs if name not in inputs and not is_optional(name)), None)
     if missing is not None:
-        raise ObservationError(f"policy '{contract.name}' needs '{missing}' too if other last_action inputs are sent")
-    return build_action(contract.action_space, given, LAST_ACTION)
+        raise ObservationError(f"{whose} needs the input '{missing}', which is missing")
+    if len({len(array) for array in inputs.values()}) > 1:
+        batches = ", ".join(f"{name} {len(inputs[name])}" for name in model.inputs if name in inputs)
+        raise ObservationError(f"the inputs of {whose} have different batch sizes: {batches}")
 
 
-def last_action_inputs(contract: Contract) -> list[TensorSpec]:
-    """Return the inputs for a last action, with the form of the outputs that gave it."""
-    return [
-        tensor.model_copy(update={"name": LAST_ACTION + tensor.name.removeprefix("action")})
-        for tensor in contract.outputs
-        if tensor.name == "action" or tensor.name.startswith("action.")
-    ]
+def _last_action(model: Model, inputs: Mapping[str, NDArray[Any]]) -> Any:
+    """Return the last action that the inputs hold, in the action space's form, or None. Raises ObservationError."""
+    names = [name for name in model.inputs if name.startswith(LAST_ACTION)]
+    missing = [name for name in names if name not in inputs]
+    if len(missing) == len(names):
+        return None
+    if missing:
+        raise ObservationError(
+            f"policy '{model.contract.name}' needs '{missing[0]}' too if other last_action inputs are sent"
+        )
+    return build_action(model.contract.action_space, inputs, LAST_ACTION)
 
 
-def _wanted_outputs(contract: Contract, given: InferRequest, *, sequenced: bool, binary: bool) -> dict[str, bool]:
-    """Return the requested outputs, and whether as bytes; an empty result means all.
-
-    Raises RequestError for outputs that do not exist.
-    """
-    known = [tensor.name for tensor in offered_outputs(contract)]
+def _wanted_outputs(model: Model, given: InferRequest, parameters: Parameters, *, sequenced: bool) -> dict[str, bool]:
+    """Return the outputs to reply with, and whether as bytes. Raises RequestError for outputs that do not exist."""
+    binary = bool(parameters.get("binary_data_output"))
     wanted: dict[str, bool] = {}
     for output in given.get("outputs") or ():
         name, own = output["name"], output.get("parameters") or {}
-        if name not in known:
-            raise RequestError(f"the output '{name[:64]}' does not exist: expected {quoted(known)}")
+        if name not in model.outputs:
+            raise RequestError(f"the output '{name[:64]}' does not exist: expected {quoted(model.outputs)}")
         if name.startswith(STATE_OUT) and sequenced:
             raise RequestError(f"the output '{name}' is kept with the sequence: request the action, or carry the state")
         refused = next((name for name in ("classification", "shared_memory_region") if name in own), None)
@@ -343,30 +329,13 @@ def _wanted_outputs(contract: Contract, given: InferRequest, *, sequenced: bool,
             raise RequestError(f"the output parameter '{refused}' is not supported: leave it out")
         chosen = own.get("binary_data")
         wanted[name] = binary if chosen is None else chosen
-    return wanted
-
-
-def offered_inputs(policy: Policy) -> list[TensorSpec]:
-    """Return the inputs that this protocol offers: the contract's, and the last action if the step is limited."""
-    return [*policy.contract.inputs, *(last_action_inputs(policy.contract) if policy.has_step_limit else ())]
-
-
-def offered_outputs(contract: Contract) -> list[TensorSpec]:
-    """Return the outputs that this protocol offers: actions and states, not the network's internal values."""
-    return [
-        tensor
-        for tensor in contract.outputs
-        if tensor.name == "action" or tensor.name.startswith(("action.", STATE_OUT))
-    ]
-
-
-# Bytes: lengths and compression.
+    return wanted or dict.fromkeys(model.outputs, binary)
 
 
 def _parse_length(value: bytes | None) -> int | None:
     if value is None:
         return None
-    if not value.isdigit() or len(value) > 15:
+    if not value.isdigit() or len(value) > 15 or not int(value):  # Triton's form without JSON is not read
         raise RequestError(
             f"Inference-Header-Content-Length must be the length of the JSON, got '{value[:32].decode('latin-1')}'"
         )
@@ -376,7 +345,7 @@ def _parse_length(value: bytes | None) -> int | None:
 def _decompress(body: Body, encoding: bytes, limit: int) -> bytes:
     """Decompress gzip or deflate to at most `limit` bytes: a few kilobytes can unpack to gigabytes."""
     try:
-        stream = zlib.decompressobj(zlib.MAX_WBITS | (16 if encoding == b"gzip" else 0))
+        stream = zlib.decompressobj(ENCODINGS[encoding])
         plain = stream.decompress(body, limit + 1)
     except zlib.error as error:
         raise RequestError(f"the body is not valid {encoding.decode()}: {error}") from None
@@ -391,7 +360,7 @@ def _decompress(body: Body, encoding: bytes, limit: int) -> bytes:
 def _compress(content: bytes, headers: Headers, accepted: bytes) -> tuple[bytes, Headers]:
     """Compress for a client that sent accept-encoding."""
     offered = {part.split(b";")[0].strip() for part in accepted.split(b",") if b"q=0" not in part.replace(b"q=0.", b"")}
-    for encoding, bits in ((b"gzip", zlib.MAX_WBITS | 16), (b"deflate", zlib.MAX_WBITS)):
+    for encoding, bits in ENCODINGS.items():
         if encoding in offered:
             stream = zlib.compressobj(COMPRESSION_LEVEL, wbits=bits)
             headers += ((b"content-encoding", encoding), (b"vary", b"accept-encoding"))

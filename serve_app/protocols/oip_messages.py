@@ -9,6 +9,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+from rlservo.serve_app.protocols.oip_tensors import DTYPES
 from rlservo.serve_app.wire.protobuf_messages import build_messages
 
 PACKAGE = "inference"
@@ -121,19 +122,8 @@ _MESSAGES: dict[str, list[str]] = {
     "InferBatchStatistics": ["uint64 batch_size"],
     "StatisticDuration": ["uint64 count", "uint64 ns"],
 }
-_DATA_TYPES = "INVALID BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP16 FP32 FP64"
 
-UNARY = (
-    "ServerLive",
-    "ServerReady",
-    "ServerMetadata",
-    "ModelReady",
-    "ModelMetadata",
-    "ModelConfig",
-    "ModelStatistics",
-    "ModelInfer",
-    "RepositoryIndex",
-)
+UNARY = tuple(name.removesuffix("Request") for name in _MESSAGES if name.endswith("Request"))
 STREAM = "ModelStreamInfer"
 _METHODS = {name: f"{name}Request {name}Response" for name in UNARY}
 _METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
@@ -143,7 +133,7 @@ messages: Any = SimpleNamespace(
         PACKAGE,
         _MESSAGES,
         oneof="parameter_choice",
-        enums={"DataType": [f"TYPE_{name}" for name in _DATA_TYPES.split()]},
+        enums={"DataType": [f"TYPE_{name}" for name in ("INVALID", *DTYPES)]},
         services={"GRPCInferenceService": _METHODS},
     )
 )

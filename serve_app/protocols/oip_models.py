@@ -10,7 +10,7 @@ extension_statistics.md; github.com/triton-inference-server/common, protobuf/mod
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,22 +20,14 @@ from typing_extensions import TypedDict
 
 import rlservo
 from rlservo.export.contract.bundle import ONNX_FILE
-from rlservo.export.contract.contract import REWARD, TensorSpec
+from rlservo.export.contract.contract import TensorSpec
 from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.protocols.http_errors import JSON, JSON_HEADERS, Headers, check_media_type, too_large
-from rlservo.serve_app.protocols.json_text import parse_json
-from rlservo.serve_app.protocols.oip_infer import (
-    BINARY,
-    LAST_ACTION,
-    STATE_IN,
-    STATE_OUT,
-    offered_inputs,
-    offered_outputs,
-)
+from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
+from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers, too_large
+from rlservo.serve_app.protocols.oip_infer import STATE_IN, STATE_OUT, is_optional, model_of
 from rlservo.serve_app.protocols.oip_tensors import datatype_of
-from rlservo.serve_app.protocols.request_fields import parse_fields, strict
+from rlservo.serve_app.protocols.request_fields import parse_fields, parse_json, strict
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route, of_policy
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
 from rlservo.serve_app.server.listing import states_of
@@ -54,7 +46,6 @@ EXTENSIONS = (
 STATES = {"ready": "READY", "loading": "LOADING", "failed": "UNAVAILABLE"}
 BACKEND = "onnxruntime"
 LARGEST_INT32 = 2**31 - 1
-NOTHING = {"count": 0, "ns": 0}
 
 
 @strict
@@ -72,46 +63,42 @@ def routes(handler: RequestHandler) -> list[Route]:
 
     def answer_of(method: Method) -> Answer:
         async def answer(call: Call) -> tuple[bytes, Headers]:
-            found = method.document(handler, call.params.get("name", ""), call.params.get("version"))
-            return orjson.dumps(found), JSON_HEADERS
+            given: Mapping[str, Any] = call.params
+            if method.verb == POST:
+                check_media_type(call.headers, OCTETS, optional=True)
+                if len(call.body) > SMALL:
+                    raise too_large(SMALL)
+                given = parse_fields(INDEX, parse_json(call.body or b"{}", such_as='{"ready": true}')[0])
+            return orjson.dumps(method.document(handler, **given)), JSON_HEADERS
 
         return answer
-
-    async def index(call: Call) -> tuple[bytes, Headers]:
-        check_media_type(call.headers, JSON, BINARY, optional=True)
-        if len(call.body) > SMALL:
-            raise too_large(SMALL)
-        document, _ = parse_json(call.body or b"{}", such_as='{"ready": true}')
-        ready = bool(parse_fields(INDEX, document).get("ready"))
-        return orjson.dumps(repository_index(handler, ready=ready)), JSON_HEADERS
 
     stats = answer_of(METHODS["ModelStatistics"])
     found = [Route(GET, f"{MODELS}/stats", Access.act, "Statistics of every model", stats)]  # before that model's
     for each in METHODS.values():
-        answer, suffix = answer_of(each), each.path.removeprefix(MODEL)
-        if suffix == each.path:
-            found.append(Route(GET, each.path, each.access, each.summary, answer))
+        if each.path.startswith(MODEL):
+            found += of_policy(GET, MODELS, each.path.removeprefix(MODEL), each.summary, answer_of(each))
         else:
-            found += of_policy(GET, MODELS, suffix, each.summary, answer=answer)
-    return [*found, Route(POST, "/v2/repository/index", Access.act, "All versions of all models", index)]
+            found.append(Route(each.verb, each.path, each.access, each.summary, answer_of(each)))
+    return found
 
 
-def server_ready(handler: RequestHandler, *_named: Any) -> dict[str, Any]:
+def server_ready(handler: RequestHandler) -> dict[str, Any]:
     """Return that the policies are loaded. Raises UnavailableError."""
     return {"ready": bool(handler.store())}
 
 
-def server_metadata(*_named: Any) -> dict[str, Any]:
+def server_metadata(_handler: RequestHandler) -> dict[str, Any]:
     """Return the server's name, version and extensions."""
     return {"name": "rlservo", "version": rlservo.__version__, "extensions": EXTENSIONS}
 
 
-def model_ready(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
+def model_ready(handler: RequestHandler, name: str = "", version: str | None = None) -> dict[str, Any]:
     """Return that a model is loaded. Raises UnknownPolicyError, UnknownVersionError, UnavailableError."""
     return {"name": handler.store().get(name, version).contract.name, "ready": True}
 
 
-def repository_index(handler: RequestHandler, *, ready: bool = False) -> list[dict[str, str]]:
+def repository_index(handler: RequestHandler, *, ready: bool | None = False, **_name: str) -> list[dict[str, str]]:
     """Return every version of every model with its state; `ready` leaves the others out."""
     handler.store()
     return [
@@ -122,70 +109,64 @@ def repository_index(handler: RequestHandler, *, ready: bool = False) -> list[di
     ]
 
 
-def model_metadata(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
+def model_metadata(handler: RequestHandler, name: str = "", version: str | None = None) -> dict[str, Any]:
     """Return a model's inputs and outputs; `version` None is the default."""
-    policy = handler.store().get(name, version)
-    contract = policy.contract
-    versions = handler.store().versions(name) if version is None else (contract.version,)
+    model = model_of(handler.store().get(name, version))
 
-    def described(tensor: TensorSpec) -> dict[str, Any]:
-        return {"name": tensor.name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}
+    def described(tensors: Mapping[str, TensorSpec]) -> list[dict[str, Any]]:
+        return [
+            {"name": name, "datatype": datatype_of(tensor.dtype), "shape": tensor.shape}
+            for name, tensor in tensors.items()
+        ]
 
     return {
         "name": name,
-        "versions": versions,
+        "versions": handler.store().versions(name) if version is None else (model.contract.version,),
         "platform": PLATFORM,
-        "inputs": [described(tensor) for tensor in offered_inputs(policy)],
-        "outputs": [described(tensor) for tensor in offered_outputs(contract)],
+        "inputs": described(model.offered),
+        "outputs": described(model.outputs),
     }
 
 
-def model_config(handler: RequestHandler, name: str, version: str | None) -> dict[str, Any]:
+def model_config(handler: RequestHandler, name: str = "", version: str | None = None) -> dict[str, Any]:
     """Return a model's configuration, as ModelConfig; `version` None is the default.
 
     Raises UnknownPolicyError, UnknownVersionError, UnavailableError.
     """
     policy = handler.store().get(name, version)
+    model = model_of(policy)
     config: dict[str, Any] = {
         "name": name,
         "platform": PLATFORM,
         "backend": BACKEND,
         "max_batch_size": min(handler.settings.max_batch, LARGEST_INT32),
-        "input": [_input(tensor) for tensor in offered_inputs(policy)],
-        "output": [_tensor(tensor) for tensor in offered_outputs(policy.contract)],
+        "input": [
+            _tensor(name, tensor) | ({"optional": True} if is_optional(name) else {})
+            for name, tensor in model.offered.items()
+        ],
+        "output": [_tensor(name, tensor) for name, tensor in model.outputs.items()],
         "default_model_filename": ONNX_FILE,
         "model_transaction_policy": {"decoupled": False},  # a request has one reply
     }
     if policy.is_stateful:
-        config["sequence_batching"] = _sequences(handler, policy)
+        config["sequence_batching"] = {
+            "max_sequence_idle_microseconds": round(handler.settings.session_idle_s * 1e6),
+            "state": [
+                {
+                    "input_name": STATE_IN + state.name,
+                    "output_name": STATE_OUT + state.name,
+                    "data_type": f"TYPE_{datatype_of(state.dtype)}",
+                    "dims": list(state.shape),
+                }
+                for state in policy.contract.state
+            ],
+        }
     return config
 
 
-def _input(tensor: TensorSpec) -> dict[str, Any]:
-    described = _tensor(tensor)
-    if tensor.name == REWARD or tensor.name.startswith((STATE_IN, LAST_ACTION)):
-        described["optional"] = True  # absent at an episode's start
-    return described
-
-
-def _tensor(tensor: TensorSpec) -> dict[str, Any]:
+def _tensor(name: str, tensor: TensorSpec) -> dict[str, Any]:
     """Return a tensor in the form of Triton's configuration: without the batch axis."""
-    return {"name": tensor.name, "data_type": f"TYPE_{datatype_of(tensor.dtype)}", "dims": list(tensor.shape[1:])}
-
-
-def _sequences(handler: RequestHandler, policy: Policy) -> dict[str, Any]:
-    return {
-        "max_sequence_idle_microseconds": round(handler.settings.session_idle_s * 1e6),
-        "state": [
-            {
-                "input_name": STATE_IN + state.name,
-                "output_name": STATE_OUT + state.name,
-                "data_type": f"TYPE_{datatype_of(state.dtype)}",
-                "dims": list(state.shape),
-            }
-            for state in policy.contract.state
-        ],
-    }
+    return {"name": name, "data_type": f"TYPE_{datatype_of(tensor.dtype)}", "dims": list(tensor.shape[1:])}
 
 
 def statistics(handler: RequestHandler, name: str = "", version: str | None = None) -> dict[str, Any]:
@@ -205,9 +186,11 @@ def statistics(handler: RequestHandler, name: str = "", version: str | None = No
 
 
 def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
-    def duration(count: int, seconds: float) -> dict[str, int]:
-        return {"count": count, "ns": round(seconds * 1e9)}
-
+    # A request is computed as soon as it is read, and `compute_infer` includes the checks of observation and action,
+    # which have no time of their own. The counts are equal all the same: perf_analyzer aborts if they differ.
+    seconds = {"success": totals.request_s, "compute_infer": totals.inference_s}
+    seconds |= dict.fromkeys(("queue", "compute_input", "compute_output"), 0.0)
+    none = {"count": 0, "ns": 0}
     return {
         "name": name,
         "version": version,
@@ -215,17 +198,10 @@ def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
         "inference_count": totals.observations,
         "execution_count": totals.requests,
         "inference_stats": {
-            "success": duration(totals.requests, totals.request_s),
-            "fail": duration(totals.failures, 0.0),  # their durations are not kept
-            # A request is computed as soon as it is read, and `compute_infer` includes the checks of observation and
-            # action, which have no time of their own. The counts are equal all the same: perf_analyzer aborts if they
-            # differ.
-            "queue": duration(totals.requests, 0.0),
-            "compute_input": duration(totals.requests, 0.0),
-            "compute_infer": duration(totals.requests, totals.inference_s),
-            "compute_output": duration(totals.requests, 0.0),
-            "cache_hit": NOTHING,
-            "cache_miss": NOTHING,
+            **{part: {"count": totals.requests, "ns": round(taken * 1e9)} for part, taken in seconds.items()},
+            "fail": {"count": totals.failures, "ns": 0},  # their durations are not kept
+            "cache_hit": none,
+            "cache_miss": none,
         },
         "batch_stats": [],
     }
@@ -237,22 +213,26 @@ class Method:
 
     path: str
     summary: str
-    document: Callable[[RequestHandler, str, str | None], dict[str, Any]]
-    """Returns the reply for a model's name and version: '' and None if the request has none."""
+    document: Callable[..., Any]
+    """Returns the reply for the request's fields, by name: those of gRPC's message."""
     access: Access = Access.act
     field: str = ""
     """Field of gRPC's reply that holds the document."""
+    verb: str = GET
 
 
 MODELS = "/v2/models"
 MODEL = f"{MODELS}/{{name}}"
 METHODS = {
-    "ServerLive": Method("/v2/health/live", "The process is alive", lambda *_named: {"live": True}, Access.open),
+    "ServerLive": Method("/v2/health/live", "The process is alive", lambda _handler: {"live": True}, Access.open),
     "ServerReady": Method("/v2/health/ready", "The policies are loaded and proven", server_ready, Access.open),
     "ServerMetadata": Method("/v2", "The server and its extensions", server_metadata),
     "ModelMetadata": Method(MODEL, "Metadata of a model", model_metadata),
     "ModelReady": Method(f"{MODEL}/ready", "The model is loaded and proven", model_ready),
     "ModelStatistics": Method(f"{MODEL}/stats", "Statistics of a model", statistics),
     "ModelConfig": Method(f"{MODEL}/config", "Configuration of a model", model_config, field="config"),
+    "RepositoryIndex": Method(
+        "/v2/repository/index", "All versions of all models", repository_index, field="models", verb=POST
+    ),
 }
 """By gRPC's names."""

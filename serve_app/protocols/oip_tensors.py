@@ -15,33 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError
-from rlservo.serve_app.protocols.json_text import json_type
+from rlservo.serve_app.protocols.request_fields import json_type
 from rlservo.serve_app.runtime.input_numbers import parse_array
 
+DATATYPES = "BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP16 FP32 FP64"  # in the order of Triton's DataType
 DTYPES: dict[str, np.dtype[Any]] = {
-    "BOOL": np.dtype("?"),
-    "UINT8": np.dtype("u1"),
-    "UINT16": np.dtype("<u2"),
-    "UINT32": np.dtype("<u4"),
-    "UINT64": np.dtype("<u8"),
-    "INT8": np.dtype("i1"),
-    "INT16": np.dtype("<i2"),
-    "INT32": np.dtype("<i4"),
-    "INT64": np.dtype("<i8"),
-    "FP16": np.dtype("<f2"),
-    "FP32": np.dtype("<f4"),
-    "FP64": np.dtype("<f8"),
+    name: np.dtype(name.lower().replace("fp", "float")).newbyteorder("<") for name in DATATYPES.split()
 }
 NAMES = {dtype.newbyteorder("="): name for name, dtype in DTYPES.items()}
-MAX_AXES = 32  # numpy itself stops at 64
 MOST_NUMBERS = 2**59  # numpy counts an array's bytes in 63 bits
-
-
-def is_shape(shape: Sequence[Any]) -> bool:
-    """Return whether numpy can make an array of this shape: even an empty one is bounded in its other axes."""
-    if len(shape) > MAX_AXES or not all(type(n) is int and 0 <= n < 2**31 for n in shape):
-        return False
-    return bool(math.prod(n for n in shape if n) < MOST_NUMBERS)
 
 
 def datatype_of(dtype: str | np.dtype[Any]) -> str:
@@ -62,7 +44,7 @@ def read_inputs(tensors: Sequence[Mapping[str, Any]], raw: memoryview) -> dict[s
     for tensor in tensors:
         name, shape, parameters = tensor["name"], tuple(tensor["shape"]), tensor.get("parameters") or {}
         label = name[:64]
-        dtype = check_form(label, shape, tensor["datatype"], parameters)
+        dtype = _check_form(label, shape, tensor["datatype"], parameters)
         size = parameters.get("binary_data_size")
         if size is None:
             inputs[name] = _from_json(label, tensor.get("data"), shape, dtype)
@@ -79,16 +61,17 @@ def read_inputs(tensors: Sequence[Mapping[str, Any]], raw: memoryview) -> dict[s
             raise RequestError(
                 f"input '{label}' needs {size} bytes after the JSON, but the body has {len(raw) - offset} left"
             )
-        inputs[name] = from_bytes(label, raw[offset : offset + size], shape, dtype)
+        inputs[name] = _from_bytes(label, raw[offset : offset + size], shape, dtype)
         offset += size
     if offset != len(raw):
         raise RequestError(f"the body has {len(raw) - offset} bytes after the last tensor's data")
     return inputs
 
 
-def check_form(label: str, shape: Sequence[Any], datatype: str, parameters: Mapping[str, Any]) -> np.dtype[Any]:
+def _check_form(label: str, shape: Sequence[int], datatype: str, parameters: Mapping[str, Any]) -> np.dtype[Any]:
     """Return the dtype of an input, whose bytes or numbers come next. Raises RequestError."""
-    if not is_shape(shape):
+    # Numpy can make no larger array; even an empty one is bounded in its other axes.
+    if not all(0 <= n < 2**31 for n in shape) or math.prod(n for n in shape if n) >= MOST_NUMBERS:
         raise RequestError(f"input '{label}': 'shape' must be a list of sizes such as [1, 27]")
     if datatype == "BYTES":
         raise RequestError(f"input '{label}' has datatype BYTES, which holds strings: send numbers")
@@ -99,7 +82,7 @@ def check_form(label: str, shape: Sequence[Any], datatype: str, parameters: Mapp
     return DTYPES[datatype]
 
 
-def from_bytes(label: str, raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+def _from_bytes(label: str, raw: memoryview, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the array in `raw`, whose length has been checked. Not writable: it shares the request's memory.
 
     Raises ObservationError for a BOOL that is neither 0 nor 1.

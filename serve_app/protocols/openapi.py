@@ -9,26 +9,28 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable
+from functools import cache
 from typing import Annotated, Any
 
 import orjson
 from fastapi import Body, FastAPI
 from fastapi.responses import JSONResponse, PlainTextResponse
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, create_model
 
 import rlservo
 from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.oip_infer import InferRequest, Tensor
+from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.oip_models import METHODS
 from rlservo.serve_app.protocols.request_fields import ActRequest
-from rlservo.serve_app.protocols.routes import WEBSOCKET, Route, RoutingTable
+from rlservo.serve_app.protocols.routes import POST, WEBSOCKET, Route, RoutingTable
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed
 from rlservo.serve_app.versions.serving_plan import Canary
 
 DESCRIPTION = "Actions from exported policies. Every error has a sentence, a code and, where useful, details."
-ANY_ROUTE = (400, 401, 403, 408, 413, 429)  # its path, key, host, page, body and rate
-OF_POLICY = (404, 503)
-OF_COMMAND = (*OF_POLICY, 409, 415)
-OF_ACTION = (*OF_COMMAND, 410, 422, 500)
+ERRORS = (400, 401, 403, 408, 413, 429, 503)  # of any route: its path, key, host, page, body and rate; or it loads
+OF_NAME = (404, 422)
+OF_POST = (404, 409, 410, 415, 422, 500)
 
 
 class ActReply(BaseModel):
@@ -109,55 +111,34 @@ class PolicyList(BaseModel):
     behind: list[str] = Field(description="Parts of the plan that this process could not follow; usually empty.")
 
 
-class ServerMetadata(BaseModel):
-    """The server, in the Open Inference Protocol."""
-
-    name: str
-    version: str
-    extensions: list[str]
-
-
-class TensorMetadata(BaseModel):
-    """An input or output of a model."""
-
-    name: str
-    datatype: str
-    shape: list[int] = Field(description="-1 is the batch.")
+def _type_of(field: Any) -> Any:
+    """Return the type that a field of a protobuf message has in JSON."""
+    scalars = {field.CPPTYPE_STRING: str, field.CPPTYPE_ENUM: str, field.CPPTYPE_BOOL: bool}
+    kind: Any = scalars.get(field.cpp_type, int) if field.message_type is None else _reply_as(field.message_type)
+    return list[kind] if isinstance(field.default_value, list) else kind
 
 
-class ModelMetadata(BaseModel):
-    """A model, in the Open Inference Protocol."""
-
-    name: str
-    versions: list[str]
-    platform: str
-    inputs: list[TensorMetadata]
-    outputs: list[TensorMetadata]
+@cache
+def _reply_as(message: Any) -> Any:
+    fields: dict[str, Any] = {field.name: (_type_of(field) | None, None) for field in message.fields}
+    return create_model(message.name, **fields)
 
 
-class ModelState(BaseModel):
-    """A line of the repository index."""
-
-    name: str
-    version: str
-    state: str
-    reason: str
+def _reply_of(method: str, part: str) -> Any:
+    """Return the reply over HTTP of a method of gRPC: its message, or that part of it."""
+    message = getattr(messages, f"{method}Response").DESCRIPTOR
+    return _type_of(message.fields_by_name[part]) if part else _reply_as(message)
 
 
-# By method and path without its version: body, reply, and errors besides those of every route.
-DESCRIBED: dict[tuple[str, str], tuple[Any, Any, tuple[int, ...]]] = {
-    ("POST", "/v1/policies/{name}/act"): (ActRequest, ActReply, OF_ACTION),
-    ("POST", "/v2/models/{name}/infer"): (InferRequest, InferReply, OF_ACTION),
-    ("GET", "/v1/policies"): (None, PolicyList, ()),
-    ("GET", "/v1/policies/{name}"): (None, Contract, OF_POLICY),
-    ("GET", "/v1/admin/policies"): (None, list[PolicyList], OF_COMMAND),
-    **{("POST", f"/v1/admin/policies/{{name}}/{name}"): (kind, Changed, OF_COMMAND) for name, kind in COMMANDS.items()},
-    ("POST", "/v2/repository/models/{name}/load"): (None, Any, OF_COMMAND),
-    ("POST", "/v2/repository/models/{name}/unload"): (None, Any, OF_COMMAND),
-    ("GET", "/v2"): (None, ServerMetadata, ()),
-    ("GET", "/v2/health/ready"): (None, Any, (503,)),
-    ("GET", "/v2/models/{name}"): (None, ModelMetadata, OF_POLICY),
-    ("POST", "/v2/repository/index"): (None, list[ModelState], (415, 503)),
+# By method and path without its version: body and reply.
+DESCRIBED: dict[tuple[str, str], tuple[Any, Any]] = {
+    ("POST", "/v1/policies/{name}/act"): (ActRequest, ActReply),
+    ("POST", "/v2/models/{name}/infer"): (InferRequest, InferReply),
+    ("GET", "/v1/policies"): (None, PolicyList),
+    ("GET", "/v1/policies/{name}"): (None, Contract),
+    ("GET", "/v1/admin/policies"): (None, list[PolicyList]),
+    **{("POST", f"/v1/admin/policies/{{name}}/{name}"): (kind, Changed) for name, kind in COMMANDS.items()},
+    **{(method.verb, method.path): (None, _reply_of(name, method.field)) for name, method in METHODS.items()},
 }
 TEXTS = ("/healthz", "/metrics")
 BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
@@ -174,12 +155,13 @@ def openapi(table: RoutingTable) -> bytes:
 
 def _describe(app: FastAPI, route: Route) -> None:
     policy = route.path.replace("/versions/{version}", "")
-    body, reply, statuses = DESCRIBED.get((route.method, policy), (None, Any, OF_POLICY if "{" in policy else ()))
+    body, reply = DESCRIBED.get((route.method, policy), (None, Any))
     extra: dict[str, Any] = {}
     if body is InferRequest:
         extra = {"requestBody": {"content": BINARY}}
     elif policy.startswith("/v2/repository/"):
         extra = {"requestBody": {"required": False, "content": {"application/json": {"schema": {"type": "object"}}}}}
+    statuses = (*ERRORS, *(OF_NAME if "{" in policy else ()), *(OF_POST if route.method == POST else ()))
     version = " (one version, or what an alias leads to)" if policy != route.path else ""
     app.add_api_route(
         route.path,
@@ -189,7 +171,7 @@ def _describe(app: FastAPI, route: Route) -> None:
         tags=[_tag(policy)],
         response_model=None if policy in TEXTS else reply,
         response_class=PlainTextResponse if policy in TEXTS else JSONResponse,
-        responses={status: {"model": ErrorReply} for status in sorted({*ANY_ROUTE, *statuses})},
+        responses={status: {"model": ErrorReply} for status in sorted({*statuses})},
         openapi_extra=extra,
     )
 

@@ -11,6 +11,7 @@ Sources: Content Security Policy Level 3; Trusted Types (W3C).
 from __future__ import annotations
 
 import asyncio
+import functools
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
@@ -54,17 +55,15 @@ def files_of_swagger_ui() -> Path:
 
 def routes(table: Callable[[], RoutingTable]) -> list[Route]:
     """Return the routes of the pages, of their files, and of a table's OpenAPI document."""
-    written: list[bytes] = []
 
+    @functools.cache
     def write() -> bytes:
         from rlservo.serve_app.protocols.openapi import openapi  # imports FastAPI
 
         return openapi(table())
 
     async def document(_call: Call) -> tuple[bytes, Headers]:
-        if not written:
-            written.append(await asyncio.to_thread(write))
-        return written[0], JSON_HEADERS
+        return await asyncio.to_thread(write), JSON_HEADERS
 
     swagger = files_of_swagger_ui()
     files = {

@@ -1,4 +1,4 @@
-"""Fields of a request for an action: types, bounds and descriptions, checked by pydantic and shown in /docs.
+"""Fields of a request for an action, checked by pydantic and shown in /docs, and the JSON that has them.
 
 Options and the episode's outcome are the same in JSON, in MessagePack and in the Open Inference Protocol's parameters.
 A field that is null counts as absent.
@@ -6,17 +6,20 @@ A field that is null counts as absent.
 
 from __future__ import annotations
 
+import contextlib
+import json
 from collections.abc import Mapping
 from functools import cache
 from itertools import islice
 from typing import Annotated, Any
 
+import orjson
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
+from pydantic_core import from_json
 from typing_extensions import TypedDict
 
 from rlservo.export.contract.errors import RequestError
 from rlservo.serve_app.episodes.request import EPISODE_FIELDS, LONGEST_SESSION_ID, NO_EPISODE, Episode, Request
-from rlservo.serve_app.protocols.json_text import json_type
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 MAX_SEED = 2**63 - 1
@@ -81,24 +84,19 @@ def _known_fields(kind: TypeAdapter[Any]) -> list[str]:
 def parse_fields(kind: TypeAdapter[Any], document: Mapping[Any, Any], what: str = "field") -> Any:
     """Return a document's checked fields, `what` each is called. Raises RequestError."""
     known = _known_fields(kind)
-    faults: list[Any] = []
-    unknown: list[tuple[Any, ...]] = []
-    if len(document) > len(known):  # pydantic would describe each of a hundred thousand unknown ones
-        unknown = [(name,) for name in islice((name for name in document if name not in known), 8)]
-    else:
-        try:
-            return kind.validate_python(document)
-        except ValidationError as error:
-            faults = error.errors(include_url=False)
-        unknown = [*islice((each["loc"] for each in faults if each["type"] == "extra_forbidden"), 8)]
+    # Before pydantic describes each of a hundred thousand.
+    unknown = [*islice((name for name in document if name not in known), 8)]
     if unknown:
-        shown = ", ".join(repr(".".join(map(str, place))[:64]) for place in unknown)
+        shown = ", ".join(repr(str(name)[:64]) for name in unknown)
         what += "s" if len(unknown) > 1 else ""
-        if len(unknown[0]) > 1:
-            raise RequestError(f"unknown {what} {shown}: leave it out")
         raise RequestError(f"unknown {what} {shown}: expected one of {', '.join(known)}", {"known": known})
-    first = faults[0]
+    try:
+        return kind.validate_python(document)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
     place = ".".join(str(part)[:64] for part in first["loc"] if part not in ("int", "str")) or f"{what}s"
+    if first["type"] == "extra_forbidden":
+        raise RequestError(f"unknown {what} '{place}': leave it out")
     expected = EXPECTED.get(first["type"]) or first["msg"].partition(" should ")[2] or first["msg"]
     raise RequestError(f"'{place}' must {expected}, got {json_type(first['input'])}")
 
@@ -113,3 +111,45 @@ def fill_request(request: Request, given: Mapping[str, Any]) -> Episode:
             elif name in Options.__optional_keys__:
                 setattr(request, name, value)
     return Episode(**said) if said else NO_EPISODE
+
+
+def parse_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[dict[str, Any], bool]:
+    """Return the JSON object in `body`, and whether it holds NaN or Infinity, which JSON does not have.
+
+    Raises RequestError.
+    """
+    document: Any = None
+    non_finite = False
+    try:
+        document = orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        # A client that sends NaN, Infinity or 1e400 has a broken sensor or a division by zero: pydantic reads these.
+        with contextlib.suppress(ValueError):
+            document, non_finite = from_json(bytes(body), allow_inf_nan=True), True
+        if not non_finite:
+            if not bytes(body).strip():
+                raise RequestError(f"the request body is empty: send a JSON object such as {such_as}") from error
+            raise RequestError(f"the request body is not JSON: {error}") from error
+    if type(document) is not dict:
+        raise RequestError(f"the request body must be a JSON object such as {such_as}, got {json_type(document)}")
+    return document, non_finite
+
+
+def json_type(value: Any) -> str:
+    """Return a JSON value's type, for an error message."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    names: dict[type, str] = {str: "a string", list: "a list", dict: "an object"}
+    if type(value) not in (int, float, *names):  # msgpack has other types besides JSON's
+        return f"a {type(value).__name__}"
+    return names.get(type(value)) or f"the number {value!r:.40}"
+
+
+def encode_json(document: Mapping[str, Any] | list[Any]) -> bytes:
+    """Return a small document's JSON; text that UTF-8 cannot encode is escaped rather than refused."""
+    try:
+        return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
+    except TypeError:
+        return json.dumps(document, default=str).encode()

@@ -11,7 +11,7 @@ from typing import TypeAlias
 from rlservo.serve_app.protocols.http_errors import Headers
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import AuditEntry
-from rlservo.serve_app.wire.asgi import ASGIApp
+from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
 GET, POST = "GET", "POST"
 WEBSOCKET = "WebSocket:"  # not a method that a client can send: those have no colon
@@ -19,18 +19,27 @@ PATHS_REMEMBERED, LONGEST_REMEMBERED = 1024, 512  # the longest that a name and 
 PARAMETER = re.compile(r"\\{(\w+)\\}")  # in an escaped path
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Call:
-    """A request whose body has been read."""
+    """A connection that a route answers: its client has been checked."""
 
+    scope: Scope
+    receive: Receive
     params: Mapping[str, str]  # of the path
     headers: Mapping[bytes, bytes]
-    body: bytes
+    reply_headers: Headers
+    """Headers of the reply besides the protocol's own."""
     audit: AuditEntry
+    may_explore: bool = False
+    """Whether its key may ask for exploring actions."""
+    body: bytes = b""
+    """Read unless the route's `reads_body` says otherwise."""
 
 
 Answer: TypeAlias = Callable[[Call], Awaitable[tuple[bytes, Headers]]]
-"""Returns the body and headers of a reply. Raises RlservoError."""
+"""Returns the body and headers of a reply. Raises RlservoError and ClientGoneError."""
+Stream: TypeAlias = Callable[[Call, Send], Awaitable[None]]
+"""Serves a WebSocket until it closes."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +51,10 @@ class Route:
     access: Access
     summary: str
     answer: Answer | None = None
-    app: ASGIApp | None = None
-    """Instead of `answer`, for actions and streams: a callable that reads the body itself."""
+    stream: Stream | None = None
+    """Instead of `answer`, for a WebSocket."""
+    reads_body: bool = False
+    """Whether `answer` reads the body itself, as for actions."""
     is_page: bool = False
     """Only for browsers, which accept HTML and not JSON; for other clients there is no such route."""
     is_documented: bool = True
@@ -51,11 +62,11 @@ class Route:
 
 
 def of_policy(
-    method: str, prefix: str, suffix: str, summary: str, *, answer: Answer | None = None, app: ASGIApp | None = None
+    method: str, prefix: str, suffix: str, summary: str, answer: Answer, *, reads_body: bool = False
 ) -> list[Route]:
     """Return the routes of a policy's default version, and of a version or an alias."""
     paths = (f"{prefix}/{{name}}{suffix}", f"{prefix}/{{name}}/versions/{{version}}{suffix}")
-    return [Route(method, path, Access.act, summary, answer, app) for path in paths]
+    return [Route(method, path, Access.act, summary, answer, reads_body=reads_body) for path in paths]
 
 
 @dataclass(frozen=True, slots=True)

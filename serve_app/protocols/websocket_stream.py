@@ -1,8 +1,12 @@
 """WebSocket per robot: the openpi policy server's protocol, compatible with its unchanged clients.
 
-On connecting the server sends one msgpack map, the metadata; then request and response alternate as binary frames
-(`msgpack_codec.py`). An error is a text frame with the JSON protocol's error body, then close 1011; a client that
-connects with `?errors=keep` gets only the text frame, with the request's `seq`, and continues.
+On connecting the server sends one msgpack map, the metadata; then request and response alternate as binary frames. A
+request is `{"obs": ...}` with the JSON protocol's options, or the observation map itself, from element name to value.
+Further fields of openpi's clients (`prompt`) are ignored, unless an element has that name. `actions` in the reply is a
+chunk of one action, `(1, ...)`, as openpi's clients expect; a batch of observations gets one chunk each.
+
+An error is a text frame with the JSON protocol's error body, then close 1011; a client that connects with
+`?errors=keep` gets only the text frame, with the request's `seq`, and continues.
 
 The recurrent state belongs to the connection: it starts when the connection opens and after `reset`, and is lost with
 the connection. A client that prefers to carry it sends `state`, as over JSON.
@@ -14,148 +18,140 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 import time
 from collections.abc import Mapping
+from typing import Any
 
+from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import (
     InternalError,
     OverloadedError,
+    RequestError,
     RlservoError,
+    TooLargeError,
     UnauthenticatedError,
     UnavailableError,
     UnknownPolicyError,
 )
-from rlservo.serve_app.episodes.request import Request, new_episode_id
+from rlservo.export.contract.spaces import DictSpec
+from rlservo.serve_app.episodes.request import Episode, Request, new_episode_id, reply_fields
 from rlservo.serve_app.episodes.session import Session
-from rlservo.serve_app.protocols.http_errors import error_answer, fail_stream, refuse_upgrade
-from rlservo.serve_app.protocols.json_text import encode_json
-from rlservo.serve_app.protocols.msgpack_codec import MsgpackCodec, encode_metadata
-from rlservo.serve_app.protocols.routes import WEBSOCKET, Route
-from rlservo.serve_app.server.access_checks import (
-    HEADERS,
-    LABEL,
-    REPLY_HEADERS,
-    REQUEST_ID,
-    StreamKey,
-    header_text,
-    presented_key,
-)
+from rlservo.serve_app.protocols.http_errors import describe, error_answer, send_reply
+from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields
+from rlservo.serve_app.protocols.routes import WEBSOCKET, Call, Route
+from rlservo.serve_app.server.access_checks import LABEL, StreamKey, header_text, presented_key
 from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.content_bounds import SMALL, check_length
 from rlservo.serve_app.server.metrics import IDLE
 from rlservo.serve_app.server.request_handler import BUG, RequestHandler
-from rlservo.serve_app.wire.asgi import Message, Receive, Scope, Send
+from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.wire.asgi import Message, Send
+from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 logger = logging.getLogger(__name__)
 
 STREAM_PATHS = ("/", "/v1/policies/{name}/stream", "/v1/policies/{name}/versions/{version}/stream")
+DENIAL = "websocket.http.response"  # the ASGI extension that answers an upgrade with an HTTP error
+FAILED = 1011  # the close code openpi's server uses for every error
 GOING_AWAY = 1001
 KEEP = b"errors=keep"
 PROTOCOL = "websocket"
 SILENT = "silent for too long"
+IGNORED = frozenset({"prompt", "env_id"})
+"""Fields that openpi's clients send for other policies (task, robot); ignored here."""
 
 
 def routes(handler: RequestHandler) -> list[Route]:
     """Return the routes of streams."""
-    stream = StreamEndpoint(handler)
-    return [Route(WEBSOCKET, path, Access.act, "Stream of actions", app=stream) for path in STREAM_PATHS]
+    codec = MsgpackCodec(handler)
 
-
-class StreamEndpoint:
-    """Answers WebSocket connections."""
-
-    def __init__(self, handler: RequestHandler) -> None:
-        self._handler = handler
-        self._codec = MsgpackCodec(handler)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one connection until the client closes it."""
-        handler, headers = self._handler, scope[HEADERS]
+    async def serve(call: Call, send: Send) -> None:
         opening = Request(
             PROTOCOL,
             "",
             None,
             time.perf_counter(),
-            label=header_text(headers, LABEL),
-            request_id=header_text(headers, REQUEST_ID),
+            label=header_text(call.headers, LABEL),
+            request_id=call.audit.request_id,
+            headers=call.headers,
         )
         try:
-            opening.policy, opening.version = self._address(scope["path_params"])
+            opening.policy, opening.version = _address(handler, call.params)
             opening.stream_id = new_episode_id(opening.label)
             opening.label = opening.label or opening.stream_id  # during a canary they all get the same version
             policy = handler.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
             handler.record_failure(opening, error)
-            await refuse_upgrade(scope, receive, send, error)
+            await refuse_upgrade(call, send, error)
             return
-        await receive()  # websocket.connect
+        await call.receive()  # websocket.connect
         try:
-            await send({"type": "websocket.accept", "headers": scope.get(REPLY_HEADERS, ())})
+            await send({"type": "websocket.accept", "headers": call.reply_headers})
         except OSError:  # the client has already disconnected
             return
         try:
             handler.open_stream(opening)
         except OverloadedError as error:
-            await fail_stream(send, error_answer(error)[1])
+            await fail_stream(send, error)
             return
         opening.stream = Session(policy) if policy.is_stateful else None
-        conversation = _Conversation(handler, self._codec, opening, scope, send)
+        stream = _Stream(handler, codec, opening, send, keeps=KEEP in call.scope.get("query_string", b"").split(b"&"))
         try:
             await send(_binary(encode_metadata(policy.contract)))
-            while (message := await receive())["type"] != "websocket.disconnect" and not conversation.is_idle:
-                await send(await conversation.answer(message))
+            while (message := await call.receive())["type"] != "websocket.disconnect" and not stream.is_idle:
+                await send(await stream.answer(message))
         except RlservoError as error:
-            await fail_stream(send, error_answer(error)[1])
+            await fail_stream(send, error)
         except OSError:  # the client disconnected while its reply was being sent
             logger.debug("a stream's client disconnected before its reply could be sent")
         except Exception:
             handler.record_bug(opening)
-            await fail_stream(send, error_answer(InternalError(BUG))[1])
+            await fail_stream(send, InternalError(BUG))
         finally:
-            conversation.timer.cancel()
+            stream.timer.cancel()
             if opening.stream is not None:
                 handler.episodes.sessions.reserve(opening.stream, 0)
             handler.close_stream(opening)
 
-    def _address(self, params: Mapping[str, str]) -> tuple[str, str | None]:
-        """Return the (policy, version) in a path's parameters; without any, the default policy."""
-        if "name" in params:
-            return params["name"], params.get("version")
-        names = self._handler.store().names
-        default = self._handler.settings.default_policy or (names[0] if len(names) == 1 else None)
-        if default is None:
-            raise UnknownPolicyError(
-                f"this server has no default policy among {', '.join(names)}: connect to /v1/policies/NAME/stream, or "
-                "serve with --default-policy (RLSERVO_DEFAULT_POLICY)",
-                {"policies": list(names)},
-            )
-        return default, None
+    return [Route(WEBSOCKET, path, Access.act, "Stream of actions", stream=serve) for path in STREAM_PATHS]
 
 
-class _Conversation:
+def _address(handler: RequestHandler, params: Mapping[str, str]) -> tuple[str, str | None]:
+    """Return the (policy, version) in a path's parameters; without any, the default policy."""
+    if "name" in params:
+        return params["name"], params.get("version")
+    names = handler.store().names
+    default = handler.settings.default_policy or (names[0] if len(names) == 1 else None)
+    if default is None:
+        raise UnknownPolicyError(
+            f"this server has no default policy among {', '.join(names)}: connect to /v1/policies/NAME/stream, or "
+            "serve with --default-policy (RLSERVO_DEFAULT_POLICY)",
+            {"policies": list(names)},
+        )
+    return default, None
+
+
+class _Stream:
     """Answers the messages of one connection in sequence, and closes it if there are none."""
 
     def __init__(
-        self, handler: RequestHandler, codec: MsgpackCodec, opening: Request, scope: Scope, send: Send
+        self, handler: RequestHandler, codec: MsgpackCodec, opening: Request, send: Send, *, keeps: bool
     ) -> None:
-        self._handler, self._codec, self._opening, self._send = handler, codec, opening, send
-        self._keeps = KEEP in scope.get("query_string", b"").split(b"&")
-        self._key = StreamKey(handler.keys, presented_key(scope[HEADERS]))
+        """`keeps`: whether the connection continues after an error."""
+        self._handler, self._codec, self._opening, self._send, self._keeps = handler, codec, opening, send, keeps
+        self._key = StreamKey(handler.keys, presented_key(opening.headers))
         self._timings: dict[str, float] | None = None
         self._is_fresh = False
         self._last = time.perf_counter()
         self.is_idle = False
-        self.timer = self._check_after(handler.settings.stream_idle_s)
-
-    def _check_after(self, seconds: float) -> asyncio.TimerHandle:
-        """Look again after some time: one callback for each period of silence, not one for each message."""
-        return asyncio.get_running_loop().call_later(seconds, self._check)
+        self._check()
 
     def _check(self) -> None:
+        """Close after a silence, or look again: one callback for each such period, not one for each message."""
         left_s = self._last + self._handler.settings.stream_idle_s - time.perf_counter()
         if left_s > 0:
-            self.timer = self._check_after(left_s)
+            self.timer = asyncio.get_running_loop().call_later(left_s, self._check)
             return
         self.is_idle = True
         self._handler.record_failure(self._opening, UnavailableError(SILENT), IDLE)
@@ -187,7 +183,10 @@ class _Conversation:
         except RlservoError as error:
             if not self._keeps or isinstance(error, UnauthenticatedError):
                 raise
-            return {"type": "websocket.send", "text": _with_seq(error_answer(error)[1], request.seq)}
+            document = describe(error)[1]
+            if request.seq is not None:
+                document["seq"] = request.seq
+            return {"type": "websocket.send", "text": encode_json(document).decode()}
         taken_s = time.perf_counter() - request.received
         self._timings = {"prev_total_ms": taken_s * 1e3}
         if taken_s > handler.admission.max_wait_s:
@@ -195,12 +194,104 @@ class _Conversation:
         return _binary(reply)
 
 
-def _with_seq(content: bytes, seq: int | None) -> str:
-    """Return an error's body with its request's number."""
-    if seq is None:
-        return content.decode()
-    return encode_json({**json.loads(content), "seq": seq}).decode()
-
-
 def _binary(content: bytes) -> Message:
     return {"type": "websocket.send", "bytes": content}
+
+
+async def refuse_upgrade(call: Call, send: Send, error: RlservoError) -> None:
+    """Answer an upgrade with an HTTP error; if the server cannot send one, accept it and send the error as a frame."""
+    await call.receive()  # websocket.connect
+    if DENIAL not in call.scope.get("extensions", {}):
+        await send({"type": "websocket.accept"})
+        await fail_stream(send, error)
+        return
+    status, content, own = error_answer(error)
+    await send_reply(send, status, content, own + call.reply_headers, kind=DENIAL)
+
+
+async def fail_stream(send: Send, error: RlservoError) -> None:
+    """End an open WebSocket with an error's body."""
+    try:
+        await send({"type": "websocket.send", "text": error_answer(error)[1].decode()})
+        await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
+    except (OSError, RuntimeError):  # the client has disconnected
+        logger.debug("a stream's client disconnected before its error could be sent")
+
+
+class MsgpackCodec:
+    """MessagePack of a stream (`Codec`): frame to `Request`, decision to a frame."""
+
+    def __init__(self, handler: RequestHandler) -> None:
+        self._handler = handler
+        self._max_bytes = handler.settings.max_body_bytes
+
+    async def receive(self, request: Request, source: Message) -> Mapping[Any, Any]:
+        """Return the map in a frame, and note its `seq` for an error's frame. Raises RequestError."""
+        content = source.get("bytes")
+        if content is None:
+            raise RequestError("the message is a text frame: send msgpack in a binary frame")
+        if len(content) > self._max_bytes:
+            raise TooLargeError(f"the message is larger than {self._max_bytes} bytes", {"max_bytes": self._max_bytes})
+        document = unpack(content, most=self._most_values(request, content) if len(content) > SMALL else None)
+        if type(document) is not dict:
+            raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
+        if "obs" in document and type(document.get("seq")) is int:
+            request.seq = document["seq"]
+        return document
+
+    def parse(self, request: Request, content: Mapping[Any, Any]) -> None:
+        """Fill the request. Raises RequestError."""
+        if not IGNORED.isdisjoint(content):
+            content = {key: value for key, value in content.items() if key not in IGNORED or self._names(request, key)}
+        if "obs" not in content:  # element names and values
+            request.obs = content
+            if type(content.get("reset")) is bool and not self._names(request, "reset"):
+                request.obs = {name: value for name, value in content.items() if name != "reset"}
+                request.episode = Episode(reset=content["reset"])
+        else:
+            request.obs = content["obs"]
+            if len(content) > 1:
+                request.episode = fill_request(request, parse_fields(ACT, content))
+
+    def encode(self, request: Request, decision: Decision) -> bytes:
+        """Return the reply's frame; `reply_options` are further timings."""
+        fields = reply_fields(request, decision)
+        fields["actions"] = _chunks(decision.action, batch=decision.batch is not None)
+        fields["server_timing"] = {"infer_ms": fields.pop("infer_ms"), **(request.reply_options or {})}
+        return pack(fields)
+
+    def _most_values(self, request: Request, content: bytes) -> int:
+        store, max_batch = self._handler.store(), self._handler.settings.max_batch
+        return max(bounds.values for bounds in check_length(store, request.policy, content, max_batch))
+
+    def _names(self, request: Request, name: str) -> bool:
+        """Return whether an observation of the request's policy has a part or an element of that name."""
+        stream = request.stream
+        policy = self._handler.store().get(request.policy, request.version) if stream is None else stream.policy
+        space = policy.contract.observation_space
+        if isinstance(space, DictSpec):
+            return name in space.spaces or name in space.ignored
+        return any(name == element.name for element in space.elements)
+
+
+def encode_metadata(contract: Contract) -> bytes:
+    """Return the frame that a client gets on connecting: the policy's name and version, and the whole contract."""
+    return pack(
+        {
+            "server": "rlservo",
+            "policy": contract.name,
+            "version": contract.version,
+            "control_rate_hz": contract.control_rate_hz,
+            "action_horizon": 1,  # steps in a chunk, as in a reply's `actions`
+            "contract": contract.model_dump(mode="json"),
+        }
+    )
+
+
+def _chunks(action: Any, *, batch: bool) -> Any:
+    """Return the action as chunks of one; each leaf of a nested one is a chunk."""
+    if isinstance(action, dict):
+        return {key: _chunks(part, batch=batch) for key, part in action.items()}
+    if isinstance(action, tuple):
+        return [_chunks(part, batch=batch) for part in action]
+    return action[:, None, ...] if batch else action[None, ...]

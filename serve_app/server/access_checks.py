@@ -38,9 +38,6 @@ PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
 LABEL = LABEL_HEADER.encode()
-HEADERS = "rlservo.headers"  # in a connection's scope: the result of `fold_headers`
-MAY_EXPLORE = "rlservo.may_explore"  # in a connection's scope: whether its key may ask for exploring actions
-REPLY_HEADERS = "rlservo.reply_headers"  # in a connection's scope: headers of its reply besides the protocol's own
 ANY_HOST = "*"
 
 

@@ -23,8 +23,7 @@ from typing import Any, BinaryIO
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.pages import FOLDER, SWAGGER_FILES
 from rlservo.serve_app.protocols.routes import WEBSOCKET
 from rlservo.serve_app.server.api_keys import Access, new_key

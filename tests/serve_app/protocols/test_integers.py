@@ -23,8 +23,7 @@ from rlservo.export.contract.contract import BakedStep, Contract, TensorSpec
 from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.oip_grpc import FIELDS, OipGrpcCodec
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.runtime.input_numbers import parse_array

@@ -185,7 +185,7 @@ def test_grpcs_messages_take_every_field_of_the_documents(store: PolicyStore) ->
     """A field that a message lacks fails the call: the two forms cannot drift apart."""
     for name in store.names:
         for method in METHODS:
-            named = {} if method.startswith("Server") else {"name": name}
+            named = {"name": name} if method.startswith("Model") else {}
             assert over_grpc(store, method, **named) is not None, method
         config = over_grpc(store, "ModelConfig", name=name).config
         assert config.input[0].data_type in (9, 11) and config.name == name  # Triton's TYPE_INT64 and TYPE_FP32

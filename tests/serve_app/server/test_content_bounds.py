@@ -22,8 +22,7 @@ from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import TooLargeError
 from rlservo.export.contract.spaces import BoxSpec, DictSpec, DiscreteSpec, Element, TupleSpec
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.server.content_bounds import ContentBounds

@@ -21,8 +21,7 @@ from rlservo.deploy.cli import app as command_line
 from rlservo.export.contract.errors import RateLimitError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.http_endpoint import PolicyApp
+from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.oip_grpc import Grpc
 from rlservo.serve_app.protocols.oip_messages import messages
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, Role, new_key
