@@ -53,6 +53,7 @@ DRAIN_S = 15  # [s] for requests in progress when the server stops
 HUNG_S = 30  # [s] until an unresponsive worker is replaced; a start on a busy machine takes as long
 EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
 DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a server at full load needs
+FEWEST_DESCRIPTORS = 64  # with fewer no connection may be left
 UVICORN = logging.getLogger("uvicorn.error")
 
 
@@ -345,11 +346,13 @@ def _stop_signals(request_stop: Callable[[], None]) -> Iterator[None]:
 
 
 def _raise_descriptor_limit() -> None:
-    """Raise the limit of open files to what a full server needs, as far as possible."""
+    """Raise the limit of open files to what a full server needs, as far as possible. Raises UsageError."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    if hard != resource.RLIM_INFINITY and hard < FEWEST_DESCRIPTORS:
+        raise UsageError(f"this process may open {hard} files, a server needs {FEWEST_DESCRIPTORS}: raise 'ulimit -n'")
     if hard != resource.RLIM_INFINITY and hard < DESCRIPTORS:
         logger.warning(
             "this process may open %d files: about %d connections at once fit, further ones wait", hard, hard - 64

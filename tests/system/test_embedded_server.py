@@ -96,6 +96,13 @@ def test_a_user_without_a_home_is_served(policies: Path) -> None:
         assert run.end(signal.SIGINT) == 0
 
 
+def test_too_few_open_files_are_said_before_the_start(policies: Path) -> None:
+    command = ["sh", "-c", 'ulimit -n 40; exec "$@"', "sh", sys.executable, "-m", "rlservo.deploy.cli", "serve"]
+    done = subprocess.run([*command, policies], capture_output=True, text=True, timeout=PATIENCE_S)
+    assert done.returncode == 2
+    assert done.stderr == "rlservo: this process may open 40 files, a server needs 64: raise 'ulimit -n'\n"
+
+
 @pytest.mark.serve
 def test_few_open_files_are_a_warning_and_connections_wait(policies: Path) -> None:
     limit_by = ["sh", "-c", 'ulimit -n 256; exec "$@"', "sh"]
