@@ -23,7 +23,7 @@ from rlservo.deploy.cli import app
 from rlservo.export.contract import errors
 from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.http_errors import status_of
+from rlservo.serve_app.protocols.error_statuses import status_of
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server import metrics
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings

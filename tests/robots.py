@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import grpc
 import numpy as np
 
-from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.runtime.recurrent_state import State
 

@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 import pytest
 import uvicorn
 
-from rlservo.serve_app.engines.local import serve_policies
 from rlservo.serve_app.engines.ports import listen, port_holder
+from rlservo.serve_app.engines.uvicorn_server import serve_policies
 from rlservo.serve_app.server.api_keys import new_key
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,7 +41,7 @@ CONNECTIONS_PER_ADDRESS = 300
 LAUNCH = """
 import json, pathlib, sys
 from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.engines.local import serve_policies
+from rlservo.serve_app.engines.uvicorn_server import serve_policies
 plan = json.loads(sys.argv[1])
 key_file = plan.pop("admin_key_file")
 try:

@@ -15,7 +15,7 @@ import pytest
 import tomllib
 
 import rlservo
-from rlservo.serve_app.protocols.oip_messages import STREAM, UNARY
+from rlservo.serve_app.protocols.open_inference.messages import STREAM, UNARY
 from rlservo.serve_app.protocols.request_fields import REQUEST_FIELDS
 
 ROOT = Path(__file__).resolve().parent.parent

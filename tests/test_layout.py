@@ -65,7 +65,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "ray.serve": ("serve_app/engines/ray_serve.py",),
     "ray.rllib": ("export/rllib/", "serve_app/learning/rllib_"),
     "ray.tune": ("export/rllib/",),
-    "uvicorn": ("serve_app/engines/local.py", "serve_app/engines/http_bounds.py"),
+    "uvicorn": ("serve_app/engines/uvicorn_server.py", "serve_app/engines/connection_bounds.py"),
     "fastapi": ("serve_app/protocols/openapi.py",),
     "torch": (
         "export/graph/", "export/proof/", "export/rllib/", "export/sources/", "export/export_policy.py",
@@ -78,7 +78,9 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "mujoco": ("envs/",),
     "grpc": ("envs/robot_server/", "serve_app/protocols/", "serve_app/engines/"),
     "google.protobuf": (
-        "envs/robot_server/", "serve_app/protocols/oip_grpc.py", "serve_app/wire/protobuf_messages.py",
+        "envs/robot_server/",
+        "serve_app/protocols/open_inference/grpc_service.py",
+        "serve_app/wire/protobuf_messages.py",
     ),
     "google.protobuf.message_factory": ("serve_app/wire/protobuf_messages.py",),
     "mcap": (
@@ -92,7 +94,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "httpx": (),
     "httpcore": (
         "serve_app/client/http_transport.py", "serve_app/repository/object_storage.py",
-        "serve_app/wire/bounded_http.py",
+        "serve_app/wire/http_deadlines.py",
     ),
     "websockets": (
         "deploy/cockpit/page.py", "envs/ros2/rosbridge_server.py", "serve_app/client/websocket_connection.py",

@@ -22,7 +22,7 @@ RAY_VARIABLES = {
     "RAY_SERVE_ENABLE_HA_PROXY", "RAY_SERVE_THROUGHPUT_OPTIMIZED", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_ADDRESS",
     "RAY_USAGE_STATS_ENABLED",
 }  # fmt: skip
-SERVERS = ("serve_app/engines/http_bounds.py", "serve_app/engines/local.py")
+SERVERS = ("serve_app/engines/connection_bounds.py", "serve_app/engines/uvicorn_server.py")
 DOTTED = re.compile(r"[A-Za-z]\w*(\.\w+)+")
 
 

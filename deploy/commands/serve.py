@@ -98,7 +98,7 @@ def serve(
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
     """
     with needs_extra("serve"):
-        from rlservo.serve_app.engines.local import RunningServer, serve_policies
+        from rlservo.serve_app.engines.uvicorn_server import RunningServer, serve_policies
         from rlservo.serve_app.wire.admin_key_file import key_file
     if record is not None:
         with needs_extra("record"):

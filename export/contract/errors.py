@@ -1,6 +1,6 @@
 """Error classes of rlservo.
 
-One table in `serve_app/protocols/http_errors.py` maps these to status codes, and one handler in `deploy/cli.py` maps
+One table in `serve_app/protocols/error_statuses.py` maps these to status codes, and one handler in `deploy/cli.py` maps
 them to exit codes.
 
     RlservoError                  error

@@ -20,7 +20,7 @@ import orjson
 from rlservo.export.contract.errors import DeadlineError, TooLargeError, UnavailableError, UsageError
 from rlservo.serve_app.client.replies import decode_error, excerpt
 from rlservo.serve_app.wire.addresses import parse_address
-from rlservo.serve_app.wire.bounded_http import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool, time_left
+from rlservo.serve_app.wire.http_deadlines import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool, time_left
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 FIRST_WAIT_S = 0.05  # before the second attempt; doubled each time

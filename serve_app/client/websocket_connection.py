@@ -17,7 +17,7 @@ from websockets.uri import parse_uri
 from rlservo.export.contract.errors import DeadlineError
 from rlservo.serve_app.client.http_transport import BrokenError, Transport
 from rlservo.serve_app.client.replies import decode_error
-from rlservo.serve_app.wire.bounded_http import send_all, time_left
+from rlservo.serve_app.wire.http_deadlines import send_all, time_left
 
 MAX_FRAME_BYTES = 64 << 20  # larger than any action or contract
 RECEIVE_BYTES = 65536

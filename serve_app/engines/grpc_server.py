@@ -11,8 +11,8 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from rlservo.export.contract.errors import UnavailableError
-from rlservo.serve_app.protocols.oip_grpc import Grpc
-from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY, messages
+from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
+from rlservo.serve_app.protocols.open_inference.messages import SERVICE, STREAM, UNARY, messages
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.wire.addresses import is_loopback
 

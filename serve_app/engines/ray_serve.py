@@ -21,10 +21,10 @@ from ray.serve import Application, Deployment
 
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.engines.autoscaling import BUSY, Load
-from rlservo.serve_app.engines.serving import Serving
+from rlservo.serve_app.engines.server_process import Serving
 from rlservo.serve_app.protocols.asgi_app import PolicyApp
-from rlservo.serve_app.protocols.oip_grpc import Grpc
-from rlservo.serve_app.protocols.oip_messages import SERVICE, STREAM, UNARY
+from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
+from rlservo.serve_app.protocols.open_inference.messages import SERVICE, STREAM, UNARY
 from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.logs import configure

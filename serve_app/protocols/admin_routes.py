@@ -14,8 +14,8 @@ import asyncio
 from pathlib import Path
 
 from rlservo.export.contract.errors import RequestError
+from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
-from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.request_fields import encode_json, parse_json
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route
 from rlservo.serve_app.server import listing

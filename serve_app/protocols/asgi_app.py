@@ -23,13 +23,12 @@ from rlservo.serve_app.episodes.request import ClientGoneError, Request
 from rlservo.serve_app.protocols import (
     admin_routes,
     json_codec,
-    oip_infer,
-    oip_models,
     pages,
     websocket_stream,
 )
+from rlservo.serve_app.protocols.error_statuses import Headers, error_answer, missing_route, send_reply
 from rlservo.serve_app.protocols.http_endpoint import receive_body
-from rlservo.serve_app.protocols.http_errors import Headers, error_answer, missing_route, send_reply
+from rlservo.serve_app.protocols.open_inference import infer, model_info
 from rlservo.serve_app.protocols.routes import GET, WEBSOCKET, Call, Found, Route, RoutingTable
 from rlservo.serve_app.server.access_checks import (
     REQUEST_ID,
@@ -74,8 +73,8 @@ def create_app(
         *websocket_stream.routes(handler),
         *_health(handler),
         *(admin_routes.routes(handler, control) if control is not None else ()),
-        *oip_infer.routes(handler),
-        *oip_models.routes(handler),
+        *infer.routes(handler),
+        *model_info.routes(handler),
         *pages.routes(lambda: table),
     ]
     table = RoutingTable(routes)

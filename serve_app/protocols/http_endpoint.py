@@ -9,7 +9,7 @@ from functools import partial
 
 from rlservo.export.contract.errors import MediaTypeError
 from rlservo.serve_app.episodes.request import ClientGoneError, Request
-from rlservo.serve_app.protocols.http_errors import JSON, Headers, too_large
+from rlservo.serve_app.protocols.error_statuses import JSON, Headers, too_large
 from rlservo.serve_app.protocols.routes import Answer, Call
 from rlservo.serve_app.server.access_checks import LABEL, header_text
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
@@ -88,8 +88,8 @@ def content_encoding(headers: Mapping[bytes, bytes], *accepted: bytes) -> bytes:
 async def receive_body(handler: RequestHandler, headers: Mapping[bytes, bytes], receive: Receive) -> Body:
     """Return a request's body within the server's limits. The first message usually holds all of it.
 
-    Every body enters this process here; its time limit is enforced by the connection (`engines/http_bounds.py`). Raises
-    TooLargeError, OverloadedError and ClientGoneError.
+    Every body enters this process here; its time limit is enforced by the connection (`engines/connection_bounds.py`).
+    Raises TooLargeError, OverloadedError and ClientGoneError.
     """
     max_bytes = handler.settings.max_body_bytes
     length = headers.get(b"content-length", b"")

@@ -8,6 +8,7 @@ import orjson
 from rlservo.export.contract.contract import contract_json
 from rlservo.export.contract.errors import ObservationError
 from rlservo.serve_app.episodes.request import Request, reply_fields
+from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.http_endpoint import (
     Body,
     act_over_http,
@@ -15,7 +16,6 @@ from rlservo.serve_app.protocols.http_endpoint import (
     content_encoding,
     receive_body,
 )
-from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields, parse_json
 from rlservo.serve_app.protocols.routes import GET, POST, Call, Route, of_policy
 from rlservo.serve_app.server import listing

@@ -1,7 +1,7 @@
 """OpenAPI document of the routing table, written by FastAPI, and the replies that it describes.
 
 FastAPI is imported when a client requests the document: it takes a third of a server's start. The requests it shows are
-those that pydantic checks (`request_fields.py`, `oip_infer.py`).
+those that pydantic checks (`request_fields.py`, `open_inference/infer.py`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from pydantic import BaseModel, Field, create_model
 
 import rlservo
 from rlservo.export.contract.contract import Contract
-from rlservo.serve_app.protocols.oip_infer import InferRequest, Tensor
-from rlservo.serve_app.protocols.oip_messages import messages
-from rlservo.serve_app.protocols.oip_models import METHODS
+from rlservo.serve_app.protocols.open_inference.infer import InferRequest, Tensor
+from rlservo.serve_app.protocols.open_inference.messages import messages
+from rlservo.serve_app.protocols.open_inference.model_info import METHODS
 from rlservo.serve_app.protocols.request_fields import ActRequest
 from rlservo.serve_app.protocols.routes import POST, WEBSOCKET, Route, RoutingTable
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed

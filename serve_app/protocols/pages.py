@@ -16,7 +16,7 @@ import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
-from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers
+from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.routes import GET, Answer, Call, Route, RoutingTable
 from rlservo.serve_app.server.api_keys import Access
 

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from rlservo.serve_app.protocols.http_errors import Headers
+from rlservo.serve_app.protocols.error_statuses import Headers
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send

@@ -37,7 +37,7 @@ from rlservo.export.contract.errors import (
 from rlservo.export.contract.spaces import DictSpec
 from rlservo.serve_app.episodes.request import Episode, Request, new_episode_id, reply_fields
 from rlservo.serve_app.episodes.session import Session
-from rlservo.serve_app.protocols.http_errors import describe, error_answer, send_reply
+from rlservo.serve_app.protocols.error_statuses import describe, error_answer, send_reply
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields
 from rlservo.serve_app.protocols.routes import WEBSOCKET, Call, Route
 from rlservo.serve_app.server.access_checks import LABEL, StreamKey, header_text, presented_key

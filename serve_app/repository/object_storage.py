@@ -18,7 +18,7 @@ from urllib.parse import quote, urlsplit
 from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
 from rlservo.export.contract.extras import install
 from rlservo.serve_app.repository.storage import TIMEOUT_S, place_of
-from rlservo.serve_app.wire.bounded_http import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool
+from rlservo.serve_app.wire.http_deadlines import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool
 
 PAGE = 2 << 20  # [bytes] of a list: 1,000 names of at most 1,024 bytes
 MOST_PAGES = 100

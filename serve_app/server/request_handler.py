@@ -1,7 +1,7 @@
 """Handling of a request of any protocol: receive, admit, parse, decide, encode; count, log and time.
 
-A protocol is a `Codec` and a transport. The transport (`http_endpoint.py`, `websocket_stream.py`, `oip_grpc.py`) makes
-a `Request` and calls `RequestHandler.answer`, which calls the codec; the transport encodes its exceptions as errors.
+A protocol is a `Codec` and a transport. The transport (`http_endpoint.py`, `websocket_stream.py`, `grpc_service.py`)
+makes a `Request` and calls `RequestHandler.answer`, which calls the codec; it encodes its exceptions as errors.
 
 A decision runs in the event loop from its first line to its last. So requests do not wait in a queue of ours: they wait
 as tasks that the loop has created and not yet run.

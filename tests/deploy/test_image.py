@@ -40,7 +40,11 @@ def test_no_secret_is_in_the_build_context_or_in_git(checkout: Path) -> None:
 
     for name in SECRETS:
         assert not in_context(f"deploy/{name}"), name
-    for name in ("deploy/kuberay/secrets.example.yaml", "deploy/compose/nginx.conf", "serve_app/engines/local.py"):
+    for name in (
+        "deploy/kuberay/secrets.example.yaml",
+        "deploy/compose/nginx.conf",
+        "serve_app/engines/uvicorn_server.py",
+    ):
         assert in_context(name), name
     assert not in_context(".git/config") and not in_context("deploy/__pycache__/cli.pyc")
     subprocess.run(["git", "init", "-q", str(checkout)], check=True)

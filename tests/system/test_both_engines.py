@@ -21,7 +21,7 @@ from loads import Load
 from rlservo.export.contract.errors import ObservationError, UnauthenticatedError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.runtime.policy import Policy
 from servers import LiveServer
 

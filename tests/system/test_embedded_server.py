@@ -18,7 +18,7 @@ import pytest
 
 from loads import CLIENTS, Load
 from rlservo.export.contract.errors import BundleError, UsageError
-from rlservo.serve_app.engines.local import serve_policies
+from rlservo.serve_app.engines.uvicorn_server import serve_policies
 from rlservo.serve_app.runtime.policy import Policy
 from servers import Run, ask, free_ports, launched, running, wait_until_served
 

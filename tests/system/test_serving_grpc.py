@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.engines.local import serve_policies
-from rlservo.serve_app.protocols.oip_grpc import Grpc, is_local
-from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.engines.uvicorn_server import serve_policies
+from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc, is_local
+from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
@@ -279,7 +279,7 @@ def test_a_taken_grpc_port_is_said_before_anything_starts(policies: Path) -> Non
 def test_messages_leave_the_process_wide_pool_alone() -> None:
     """KServe's and Triton's packages register `inference.*` there."""
     code = (
-        "import rlservo.serve_app.protocols.oip_messages\n"
+        "import rlservo.serve_app.protocols.open_inference.messages\n"
         "from google.protobuf import descriptor_pool\n"
         "try: descriptor_pool.Default().FindMessageTypeByName('inference.ModelInferRequest')\n"
         "except KeyError: print('free')"

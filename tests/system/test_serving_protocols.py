@@ -14,7 +14,7 @@ import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.engines.local import serve_policies
+from rlservo.serve_app.engines.uvicorn_server import serve_policies
 from rlservo.serve_app.runtime.policy import Policy
 from servers import LiveServer, free_ports
 

@@ -19,8 +19,8 @@ from rlservo.export.contract.errors import RequestError, SessionLostError, Unkno
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.oip_grpc import Grpc
-from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
+from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.runtime.recurrent_state import StateTensors

@@ -24,8 +24,8 @@ from rlservo.export.contract.errors import ObservationError, RequestError
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
-from rlservo.serve_app.protocols.oip_grpc import FIELDS, OipGrpcCodec
-from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.open_inference.grpc_service import FIELDS, OipGrpcCodec
+from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.runtime.input_numbers import parse_array
 from rlservo.serve_app.runtime.observation_check import ObservationParser
 from rlservo.serve_app.runtime.options import PolicyOptions

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.oip_grpc import Grpc
-from rlservo.serve_app.protocols.oip_messages import messages
-from rlservo.serve_app.protocols.oip_models import METHODS, statistics
+from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
+from rlservo.serve_app.protocols.open_inference.messages import messages
+from rlservo.serve_app.protocols.open_inference.model_info import METHODS, statistics
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore

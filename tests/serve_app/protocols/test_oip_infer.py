@@ -203,8 +203,8 @@ def test_an_empty_tensor_that_numpy_cannot_make_is_refused(ask: Ask, more: dict[
 def test_over_grpc_it_is_refused_too(store: PolicyStore) -> None:
     from rlservo.export.contract.errors import RequestError
     from rlservo.serve_app.episodes.request import Request
-    from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
-    from rlservo.serve_app.protocols.oip_messages import messages
+    from rlservo.serve_app.protocols.open_inference.grpc_service import OipGrpcCodec
+    from rlservo.serve_app.protocols.open_inference.messages import messages
 
     codec = OipGrpcCodec(create_app(lambda: store, ServerSettings()).handler)
     for raw in ([b""], []):

@@ -23,8 +23,8 @@ from rlservo.export.contract.errors import TooLargeError
 from rlservo.export.contract.spaces import BoxSpec, DictSpec, DiscreteSpec, Element, TupleSpec
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
-from rlservo.serve_app.protocols.oip_grpc import OipGrpcCodec
-from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.open_inference.grpc_service import OipGrpcCodec
+from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.server.content_bounds import ContentBounds
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack

@@ -22,8 +22,8 @@ from rlservo.export.contract.errors import RateLimitError, UsageError
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
-from rlservo.serve_app.protocols.oip_grpc import Grpc
-from rlservo.serve_app.protocols.oip_messages import messages
+from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
+from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, Role, new_key
 from rlservo.serve_app.server.current_keys import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings

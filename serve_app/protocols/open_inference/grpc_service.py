@@ -1,7 +1,7 @@
 """Open Inference Protocol over gRPC: the methods of `GRPCInferenceService`, called by an engine's gRPC server.
 
-The same policies, options and errors as over HTTP (`oip_infer.py`); an error's HTTP status becomes a gRPC status, its
-code goes into the trailing metadata. The messages are in `oip_messages.py`; a reply's tensors are raw or typed as the
+The same policies, options and errors as over HTTP (`infer.py`); an error's HTTP status becomes a gRPC status, its
+code goes into the trailing metadata. The messages are in `messages.py`; a reply's tensors are raw or typed as the
 request's were.
 """
 
@@ -33,11 +33,11 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols import oip_models
-from rlservo.serve_app.protocols.http_errors import describe
-from rlservo.serve_app.protocols.oip_infer import ReplyOptions, fill, reply_of
-from rlservo.serve_app.protocols.oip_messages import messages
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, datatype_of
+from rlservo.serve_app.protocols.error_statuses import describe
+from rlservo.serve_app.protocols.open_inference import model_info
+from rlservo.serve_app.protocols.open_inference.infer import ReplyOptions, fill, reply_of
+from rlservo.serve_app.protocols.open_inference.messages import messages
+from rlservo.serve_app.protocols.open_inference.tensors import DTYPES, datatype_of
 from rlservo.serve_app.server.access_checks import LABEL, StreamKey, authorize, header_text, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
@@ -89,7 +89,7 @@ class Grpc:
     def _look_up(self, name: str, content: bytes) -> Any:
         """Return the reply to a method without an action."""
         asked, reply = _parse(getattr(messages, f"{name}Request"), content), getattr(messages, f"{name}Response")()
-        method = oip_models.METHODS[name]
+        method = model_info.METHODS[name]
         try:
             document = method.document(self._handler, **{field.name: value for field, value in asked.ListFields()})
         except (UnavailableError, UnknownPolicyError):
@@ -153,7 +153,7 @@ class Grpc:
             headers=headers,
         )
         try:
-            access = oip_models.METHODS[method].access if method in oip_models.METHODS else Access.act
+            access = model_info.METHODS[method].access if method in model_info.METHODS else Access.act
             key = authorize(self._handler.keys, presented_key(headers), access)
             request.may_explore = key is None or key.may_explore
         except RlservoError as error:

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from rlservo.serve_app.engines.http_bounds import HEAD_S, MAX_HEAD_BYTES, MAX_PIPELINED
+from rlservo.serve_app.engines.connection_bounds import HEAD_S, MAX_HEAD_BYTES, MAX_PIPELINED
 from rlservo.serve_app.server.api_keys import new_key
 from servers import Run, connected, launched
 

@@ -27,6 +27,7 @@ from rlservo.export.contract.contract import REWARD
 from rlservo.export.contract.errors import ObservationError, RequestError, quoted
 from rlservo.export.contract.nested import action_leaves, build_action
 from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, Request, reply_fields
+from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers, too_large
 from rlservo.serve_app.protocols.http_endpoint import (
     OCTETS,
     Body,
@@ -35,8 +36,7 @@ from rlservo.serve_app.protocols.http_endpoint import (
     content_encoding,
     receive_body,
 )
-from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers, too_large
-from rlservo.serve_app.protocols.oip_tensors import DTYPES, read_inputs, write_tensor
+from rlservo.serve_app.protocols.open_inference.tensors import DTYPES, read_inputs, write_tensor
 from rlservo.serve_app.protocols.request_fields import Options, fill_request, parse_fields, parse_json, strict
 from rlservo.serve_app.protocols.routes import POST, Route, of_policy
 from rlservo.serve_app.runtime.policy import Policy

@@ -9,7 +9,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from rlservo.serve_app.protocols.oip_tensors import DTYPES
+from rlservo.serve_app.protocols.open_inference.tensors import DTYPES
 from rlservo.serve_app.wire.protobuf_messages import build_messages
 
 PACKAGE = "inference"
@@ -76,7 +76,7 @@ _MESSAGES: dict[str, list[str]] = {
     "RepositoryIndexRequest": ["string repository_name", "bool ready"],
     "RepositoryIndexResponse": ["repeated RepositoryIndexResponse.ModelIndex models"],
     "RepositoryIndexResponse.ModelIndex": ["string name", "string version", "string state", "string reason"],
-    # Triton's configuration and statistics, reduced to the fields filled here (`oip_models.py`).
+    # Triton's configuration and statistics, reduced to the fields filled here (`model_info.py`).
     "ModelConfigRequest": ["string name", "string version"],
     "ModelConfigResponse": ["ModelConfig config"],
     "ModelConfig": [

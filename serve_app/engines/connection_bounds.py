@@ -19,7 +19,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 
 from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError, RlservoError
 from rlservo.serve_app.episodes.request import Request
-from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, error_answer, send_reply
+from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, error_answer, send_reply
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 

@@ -22,10 +22,10 @@ import rlservo
 from rlservo.export.contract.bundle import ONNX_FILE
 from rlservo.export.contract.contract import TensorSpec
 from rlservo.export.contract.errors import RequestError
+from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers, too_large
 from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
-from rlservo.serve_app.protocols.http_errors import JSON_HEADERS, Headers, too_large
-from rlservo.serve_app.protocols.oip_infer import STATE_IN, STATE_OUT, is_optional, model_of
-from rlservo.serve_app.protocols.oip_tensors import datatype_of
+from rlservo.serve_app.protocols.open_inference.infer import STATE_IN, STATE_OUT, is_optional, model_of
+from rlservo.serve_app.protocols.open_inference.tensors import datatype_of
 from rlservo.serve_app.protocols.request_fields import parse_fields, parse_json, strict
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route, of_policy
 from rlservo.serve_app.server.api_keys import Access

@@ -26,14 +26,14 @@ import uvicorn
 from uvicorn.supervisors import Multiprocess
 
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
-from rlservo.serve_app.engines.http_bounds import (
+from rlservo.serve_app.engines.connection_bounds import (
     HANDLER,
     MAX_CONNECTIONS,
     BoundedHttp,
     BoundedWebSocket,
 )
 from rlservo.serve_app.engines.ports import BACKLOG, listen
-from rlservo.serve_app.engines.serving import Serving
+from rlservo.serve_app.engines.server_process import Serving
 from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import Role, check_exposure
