@@ -14,7 +14,7 @@ from pathlib import Path
 from rlservo.export.contract.errors import DeadlineError, UnavailableError, UsageError
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.recording.episodes import Episode, EpisodeAssembler
-from rlservo.serve_app.recording.reader import FileFacts, FileReader, Recording, RecordingError
+from rlservo.serve_app.recording.reader import MAGIC, FileFacts, FileReader, Recording, RecordingError
 from rlservo.serve_app.recording.recorder import FILE_NAME, SUFFIX
 
 SILENT_NS = 60_000_000_000
@@ -99,6 +99,8 @@ class FollowedRecordings:
                 continue
             assembler = self._writers.setdefault(_writer_of(path), EpisodeAssembler())
             try:
+                if path.stat().st_size < len(MAGIC):  # its writer has made it, and written nothing yet
+                    continue
                 for entry in reader.entries():
                     for episode in (*assembler.add(entry), *assembler.give_up(entry.log_time_ns - SILENT_NS)):
                         yield Ended(str(path), f"{episode.id}@{episode.wall_ns[0]}", episode)

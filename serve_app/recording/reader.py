@@ -24,6 +24,7 @@ from rlservo.serve_app.recording.log_file import DROPPED_TOPIC
 from rlservo.serve_app.recording.policy_format import PolicyFormat
 from rlservo.serve_app.recording.recorder import SUFFIX, is_being_written
 
+MAGIC = b"\x89MCAP0\r\n"  # the first bytes of a file
 LARGEST_RECORD = 512 * 1024 * 1024  # a larger length means damage
 CLOCK_JUMP_NS = 1_000_000_000
 BAG_PROFILE = "ros2"  # profile of files that `ros2 bag record` writes
@@ -138,10 +139,10 @@ def read_records(facts: FileFacts) -> Iterator[McapRecord]:
                 facts.position = stream.tell()
             facts.whole = True  # footer and closing magic were present
         except InvalidMagic:
-            if stream.tell() <= len(b"\x89MCAP0\r\n"):
+            if stream.tell() <= len(MAGIC):
                 raise RecordingError(f"{path} is not an MCAP file") from None
         except (EndOfFile, struct.error) as error:  # in the middle of a record
-            if stream.tell() < len(b"\x89MCAP0\r\n"):
+            if stream.tell() < len(MAGIC):
                 raise RecordingError(f"{path} is not an MCAP file, or empty") from error
         except (McapError, CRCValidationError, ValueError, MemoryError, OverflowError) as error:
             damaged(error)

@@ -78,6 +78,19 @@ def test_a_file_that_is_no_recording_is_named_once_and_the_others_are_read(
     assert len(said) == 1 and "another.mcap is not an MCAP file: left out" in said[0]
 
 
+def test_a_file_that_was_seen_before_its_first_byte_is_read_later(ur5: Path, tmp_path: Path, said: list[str]) -> None:
+    recorded, followed = tmp_path / "recorded", FollowedRecordings([tmp_path], said.append)
+    recorded.mkdir()
+    with Recorder(recorded) as recorder, WithRecording(Policy.load(ur5), recorder) as policy:
+        act(policy, 2, ends=True)
+    (whole,) = recorded.iterdir()
+    (growing := tmp_path / whole.name).touch()
+    for end in (0, 3, None):
+        growing.write_bytes(whole.read_bytes()[:end])
+        found = list(followed.poll())
+    assert len(found) == 1 and said == []
+
+
 def test_the_clocks_of_servers_may_be_apart(
     ur5: Path, tmp_path: Path, said: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
