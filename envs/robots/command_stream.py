@@ -325,7 +325,7 @@ class CommandStream:
         """Let a person lead the arm once it is at rest, or hold it again at its position."""
         if not to_person:
             self._robot.hold()
-            self._limiter.restart(self._robot.read().positions)  # the order may have taken a while
+            self._limiter.restart(self._reading.positions)
             self._phase = Phase.HOLD
         elif np.abs(self._limiter.velocity).max() < AT_REST:
             self._robot.free()
