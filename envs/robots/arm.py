@@ -38,9 +38,9 @@ class Reading(NamedTuple):
     age_s: float | None  # at its arrival; None if the clocks cannot be compared
     positions: Vector  # [rad], (6,)
     velocities: Vector  # [rad/s], (6,)
-    is_program_running: bool  # read before the modes, so that the stop which ended it is among them
     robot_mode: int
     safety_mode: int
+    is_program_running: bool
     speed_fraction: float  # of the speed slider, 0 to 1
     is_connected: bool = True
 

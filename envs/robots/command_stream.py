@@ -153,7 +153,7 @@ class _RtdeConnection:
         receive = self._receive
         return Reading(
             receive.getTimestamp(), None, np.array(receive.getActualQ()), np.array(receive.getActualQd()),
-            bool(receive.getRobotStatus() & 2), receive.getRobotMode(), receive.getSafetyMode(),
+            receive.getRobotMode(), receive.getSafetyMode(), bool(receive.getRobotStatus() & 2),
             receive.getTargetSpeedFraction(), receive.isConnected(),
         )  # fmt: skip
 

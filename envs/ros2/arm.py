@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from rlservo.envs.robots.command_stream import StreamSettings
 
 RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of commands, if the limits name none
-# In the order in which messages that wait are taken: a stop is known before the end of the program that it causes.
-MODES = ("safety_mode", "robot_mode", "program_running")
+MODES = ("program_running", "robot_mode", "safety_mode")
 # Distance of a joint from its setpoint beyond which it does not follow: at rest, plus this much of its velocity.
 FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
 AHEAD_S = 0.1  # of a trajectory's point: the controller begins each new one at the arm's lagging position
@@ -58,7 +57,7 @@ class RosArmConnection:
         self._state: tuple[float, float | None, Vector, Vector] | None = None  # stamp, age, positions, velocities
         self._problem = f"no message on {address['joint_states']}: is the driver running, with this ROS_DOMAIN_ID"
         self._speed_percent = 100.0 if address["status"] == "off" else float("nan")
-        self._modes: dict[str, int] = {"safety_mode": 1, "robot_mode": RUNNING, "program_running": 1}
+        self._modes: dict[str, int] = dict(zip(MODES, (1, RUNNING, 1), strict=True))
         self._topic = address["commands"] or COMMAND_TOPICS[self._how]
         self._setpoint: Vector | None = None
         self._fastest = 0.0  # [rad/s], of the latest setpoints
@@ -92,7 +91,7 @@ class RosArmConnection:
         assert self._state is not None
         modes, fraction = self._modes, 1.0 if self._how == "trajectory" else self._speed_percent / 100.0
         return Reading(
-            *self._state, bool(modes["program_running"]), modes["robot_mode"], modes["safety_mode"], fraction
+            *self._state, modes["robot_mode"], modes["safety_mode"], bool(modes["program_running"]), fraction
         )
 
     def target(self) -> Vector:
