@@ -99,15 +99,15 @@ class RosArmConnection:
         assert self._state is not None
         return self._state[2]
 
-    def send(self, setpoint: Vector) -> bool:
+    def send(self, goal: Vector) -> bool:
         """Publish the next setpoint [rad] (6,). Raises RobotError if the arm does not follow."""
         measured = self.target()
-        before = setpoint if self._setpoint is None else self._setpoint
-        velocity = (setpoint - before) * self.rate_hz
-        self._setpoint = setpoint
+        before = goal if self._setpoint is None else self._setpoint
+        velocity = (goal - before) * self.rate_hz
+        self._setpoint = goal
         forgotten = self._fastest * (1.0 - 1.0 / (FOLLOWING_LAG_S * self.rate_hz))
         self._fastest = max(float(np.abs(velocity).max()), forgotten)
-        away = np.abs(setpoint - measured)
+        away = np.abs(goal - measured)
         if away.max() > FOLLOWING_ERROR + FOLLOWING_LAG_S * self._fastest:
             joint = self._joints[int(away.argmax())]
             raise RobotError(
@@ -115,12 +115,12 @@ class RosArmConnection:
                 f"{self._topic} active (ros2 control list_controllers)"
             )
         if self._how == "position":
-            self._publish({"data": setpoint.tolist()})
+            self._publish({"data": goal.tolist()})
         elif self._how == "velocity":
-            self._publish({"data": (velocity + DRIFT_GAIN * (setpoint - measured) * bool(velocity.any())).tolist()})
+            self._publish({"data": (velocity + DRIFT_GAIN * (goal - measured) * bool(velocity.any())).tolist()})
             self.keep_alive()
         else:
-            self._publish(self._trajectory(setpoint, velocity))
+            self._publish(self._trajectory(goal, velocity))
         return True
 
     def keep_alive(self) -> None:

@@ -51,7 +51,7 @@ RATE_HZ = 20.0
 AGE_BOUND_S = 0.3  # [s] oldest input that may be acted on: scans come at 12.5 Hz, or 10
 LOST_S = 2.0  # [s] without odometry, after which the connection counts as lost
 DEADMAN_S = 0.5  # [s], oldest dead-man message
-SCALES = (1.0, 0.75, 0.5, 0.25, 0.0)  # of a velocity, tried in order until nothing is in the way
+SCALES = (1.0, 0.75, 0.5, 0.25)  # of a velocity, tried in order if something is in the way
 INSTANTS = 5  # points checked on the path to a standstill
 
 Vector = NDArray[np.float64]
@@ -258,9 +258,13 @@ class RosBase:
             self._counts[f"acceleration.{name}"] += abs(wanted - now) > 2.0 * most
             changed.append(now + step)
         linear, angular = changed
-        scale = next(one for one in SCALES if self._is_clear(linear * one, angular * one))
-        self._counts["stop_distance"] += scale < 1.0
-        return linear * scale, angular * scale
+        if self._is_clear(linear, angular):
+            return linear, angular
+        self._counts["stop_distance"] += 1
+        for scale in SCALES[1:]:
+            if self._is_clear(linear * scale, angular * scale):
+                return linear * scale, angular * scale
+        return 0.0, 0.0
 
     def _wanted(self) -> Twist2:
         now = time.monotonic()
