@@ -8,7 +8,7 @@ import sys
 import threading
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -17,6 +17,9 @@ from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.deploy.commands.rollout import TransportKind, acting_policy, with_fallback
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra, require
+
+if TYPE_CHECKING:
+    from rlservo.envs.ros2.link import Topics
 
 
 def ros2(
@@ -122,35 +125,47 @@ def ros2_sim(
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     with needs_extra("sim", "mujoco"):
         from rlservo.envs.robots.arm import RobotError
-        from rlservo.envs.ros2.rclpy_link import RclpyLink
-        from rlservo.envs.ros2.simulated_arm import SimulatedArm
-        from rlservo.envs.ros2.simulated_base import SimulatedBase
-        from rlservo.envs.ros2.simulation_loop import run
-    where: list[str] = []
-    links: list[Any] = []
+        from rlservo.envs.ros2.simulation_loop import SimulatedRobot, run
+        from rlservo.envs.ur_controller.server import Link as LinkFaults
+    where = []
     stop = threading.Event()
+    simulated: SimulatedRobot
     with ExitStack() as cleanup:
         try:
-            simulated: SimulatedArm | SimulatedBase
-            if robot != "mir100":
-                simulated = SimulatedArm(robot, controller=controller, prefix=prefix)
-                where.append(f"ROS 2, {controller} controller")
-            else:
+            if robot == "mir100":
+                from rlservo.envs.ros2.simulated_base import SimulatedBase
+
+                links: list[Topics] = []
                 if ros:
+                    from rlservo.envs.ros2.rclpy_link import RclpyLink
+
                     links.append(RclpyLink("mir100_sim", is_unique=True))
                     where.append("ROS 2")
                 if rosbridge_port is not None:
                     with needs_extra("client", "websockets"):
                         from rlservo.envs.ros2.rosbridge_server import RosbridgeServer
-                    links.append(bridge := RosbridgeServer("127.0.0.1", rosbridge_port))
+                    bridge = RosbridgeServer("127.0.0.1", rosbridge_port)
+                    links.append(bridge)
                     where.append(f"rosbridge://127.0.0.1:{bridge.port}")
-                simulated = SimulatedBase(links, world=world, is_stamped=twist == "TwistStamped")
+                base = SimulatedBase(links, world=world, is_stamped=twist == "TwistStamped", faults=LinkFaults())
+                simulated = base
+                cleanup.callback(base.close)
+            else:
+                from rlservo.envs.ros2.simulated_arm import SimulatedArm
+
+                arm = SimulatedArm(robot, controller=controller, prefix=prefix, faults=LinkFaults())
+                simulated = arm
+                cleanup.callback(arm.close)
+                where.append(f"ROS 2, {controller} controller")
         except (RobotError, ValueError) as error:
             raise UsageError(str(error)) from error
-        cleanup.callback(simulated.close)
         cleanup.enter_context(terminal.ctrl_c_sets(stop))
-        ready = f"{robot} on {' and '.join(where)}; help and Enter lists commands, Ctrl-C ends it"
-        run(simulated, stop, lambda: terminal.show(ready), sys.stdin)
+        run(
+            simulated,
+            stop,
+            lambda: terminal.show(f"{robot} on {' and '.join(where)}; help and Enter lists commands, Ctrl-C ends it"),
+            sys.stdin,
+        )
 
 
 def _pass_ros_arguments(words: list[str], mapping: Path | None) -> None:

@@ -11,7 +11,6 @@ import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -104,37 +103,48 @@ def _default(side: str, name: str, index: int) -> str:
 
 
 @dataclass
+class _Latest:
+    message: Any = None
+    received_s: float = 0.0
+    age_s: float = 0.0
+
+
+@dataclass
 class ElementInputs:
     """The newest message of each topic, as one observation."""
 
     link: Link
     places: Sequence[Place]
     max_age_s: float
-    _latest: dict[str, tuple[Any, float]] = field(default_factory=dict)  # and when it was made, by time.monotonic()
+    _latest: dict[str, _Latest] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for topic, kind in {place.topic: place.kind for place in self.places}.items():
-            self.link.subscribe(topic, kind, partial(self._take, topic))
+            self._latest[topic] = latest = _Latest()
+            self.link.subscribe(topic, kind, self._taker(latest))
 
     def observe(self) -> tuple[NDArray[np.float32] | None, str]:
         """Return the observation, or None and why there is none that may be acted on."""
-        latest, now_s = dict(self._latest), time.monotonic()
-        for topic in dict.fromkeys(place.topic for place in self.places):
-            if topic not in latest:
+        for topic, latest in self._latest.items():
+            if latest.message is None:
                 return None, f"no message on {topic}"
-            if (age_s := now_s - latest[topic][1]) > self.max_age_s:
+            age_s = time.monotonic() - latest.received_s + latest.age_s
+            if age_s > self.max_age_s:
                 return None, f"the newest message on {topic} is {age_s:.2f} s old, more than {self.max_age_s:g} s"
-        values = [place.read(latest[place.topic][0]) for place in self.places]
+        values = [place.read(self._latest[place.topic].message) for place in self.places]
         for place, value in zip(self.places, values, strict=True):
             if value is None:
                 path = ".".join(place.path) + (f"[{place.index}]" if place.index else "")
                 return None, f"a message on {place.topic} has no finite {path}"
         return np.array(values, dtype=np.float32), ""
 
-    def _take(self, topic: str, message: Any) -> None:
-        made_s = stamp_of(message)  # without one, it is as old as its arrival
-        age_s = 0.0 if made_s is None else abs(self.link.now_s() - made_s)
-        self._latest[topic] = message, time.monotonic() - age_s
+    def _taker(self, latest: _Latest) -> Callable[[Any], None]:
+        def take(message: Any) -> None:
+            made_s = stamp_of(message)  # without one, it is as old as its arrival
+            latest.age_s = 0.0 if made_s is None else abs(self.link.now_s() - made_s)
+            latest.received_s, latest.message = time.monotonic(), message
+
+        return take
 
 
 class ElementOutputs:

@@ -11,7 +11,6 @@ Vector = NDArray[np.float64]
 
 RTDE, ROS2, ROSBRIDGE = "rtde://", "ros2:", "rosbridge://"
 MUJOCO = "mujoco"
-RUNNING = 7  # robot_mode
 STOP_NAMES = {3: "protective_stop", 5: "safeguard_stop", 6: "emergency_stop", 7: "emergency_stop"}
 
 
@@ -29,20 +28,6 @@ class ArmState(NamedTuple):
     age_s: float  # its age then, as far as the link's delay varies
     mode: str  # "running", or the reason why not
     safety: str  # "normal", or the kind of stop
-
-
-class Reading(NamedTuple):
-    """The newest state of an arm's controller."""
-
-    time_s: float  # the robot's own clock
-    age_s: float | None  # at its arrival; None if the clocks cannot be compared
-    positions: Vector  # [rad], (6,)
-    velocities: Vector  # [rad/s], (6,)
-    robot_mode: int
-    safety_mode: int
-    is_program_running: bool
-    speed_fraction: float  # of the speed slider, 0 to 1
-    is_connected: bool = True
 
 
 class Arm(Protocol):

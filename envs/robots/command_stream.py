@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.envs.robots.arm import ROS2, RUNNING, STOP_NAMES, Reading, RobotError
+from rlservo.envs.robots.arm import ROS2, STOP_NAMES, RobotError
 from rlservo.envs.robots.limits import COUNTED, LATE, Limits, MotionLimiter
 from rlservo.envs.robots.link_delay import LinkDelay
 from rlservo.envs.robots.shared_block import SharedBlock
@@ -30,7 +30,7 @@ from rlservo.envs.ur.simulation import URSimulation
 
 READY, FAILED = "ready", "failed: "  # lines on standard output; a fault after READY is also FAILED
 FIRST_STATE_S = 5.0
-SAFE_MODES = (1, 2)  # safety_mode: normal and reduced
+RUNNING, SAFE_MODES = 7, (1, 2)  # robot_mode, safety_mode: normal and reduced
 STARTUP_MODES = (
     "no controller", "disconnected", "confirm safety", "booting", "power off", "power on", "idle", "backdrive",
 )  # fmt: skip
@@ -100,21 +100,7 @@ class StreamSettings:
         return cls(**{**values, "limits": Limits.of(values["limits"])})
 
 
-class Connection(Protocol):
-    """A connection to the arm; joint positions are [rad] (6,)."""
-
-    rate_hz: float  # of commands
-
-    def read(self) -> Reading: ...
-    def target(self) -> Vector: ...  # the joint positions that the controller holds
-    def send(self, setpoint: Vector) -> bool: ...  # False if it is refused
-    def keep_alive(self) -> None: ...  # for the watchdog, without a command
-    def free(self) -> None: ...  # a person may lead the arm by hand
-    def hold(self) -> None: ...  # from now on again
-    def close(self) -> None: ...  # ends the program and disconnects
-
-
-class _RtdeConnection:
+class _Connection:
     """The two connections of ur_rtde's client. Raises RobotError with what to do."""
 
     def __init__(self, settings: StreamSettings) -> None:
@@ -125,8 +111,8 @@ class _RtdeConnection:
         except ImportError as error:
             how = "pip install '.[ur]' in the checkout of rlservo"
             raise RobotError(f"a real UR arm needs ur_rtde ({error}): {how}") from error
-        self._control: Any = None
-        self._limits, host = settings.limits, settings.host
+        self.control: Any = None
+        host = settings.host
         try:
             dashboard = dashboard_client.DashboardClient(host)
             dashboard.connect()
@@ -139,40 +125,19 @@ class _RtdeConnection:
         self.is_e_series = settings.ur_model.endswith("e")
         self.rate_hz = settings.limits.rate_hz or (500.0 if self.is_e_series else 125.0)
         try:
-            self._receive = rtde_receive.RTDEReceiveInterface(host, self.rate_hz, VARIABLES)
+            self.receive = rtde_receive.RTDEReceiveInterface(host, self.rate_hz, VARIABLES)
             self._check_modes(host)
-            self._control = rtde_control.RTDEControlInterface(host, self.rate_hz)
+            self.control = rtde_control.RTDEControlInterface(host, self.rate_hz)
         except RobotError:
             raise
         except Exception as error:  # RuntimeError, logic_error as RuntimeError, boost's own
             hint = "enable remote control on the pendant (local, top right)" if self.is_e_series else "see the pendant"
             raise RobotError(f"the controller at {host} accepts no program ({str(error).strip()}): {hint}") from error
-        self._control.setWatchdog(settings.limits.watchdog_hz)  # from here on commands must follow immediately
+        self.control.setWatchdog(settings.limits.watchdog_hz)  # from here on commands must follow immediately
 
-    def read(self) -> Reading:
-        receive = self._receive
-        return Reading(
-            receive.getTimestamp(), None, np.array(receive.getActualQ()), np.array(receive.getActualQd()),
-            receive.getRobotMode(), receive.getSafetyMode(), bool(receive.getRobotStatus() & 2),
-            receive.getTargetSpeedFraction(), receive.isConnected(),
-        )  # fmt: skip
-
-    def target(self) -> Vector:
-        return np.array(self._receive.getTargetQ())
-
-    def send(self, setpoint: Vector) -> bool:
-        lookahead_s, gain = self._limits.lookahead_s, self._limits.gain
-        return bool(self._control.servoJ(setpoint.tolist(), 0.0, 0.0, 1.0 / self.rate_hz, lookahead_s, gain))
-
-    def keep_alive(self) -> None:
-        self._control.kickWatchdog()
-
-    def free(self) -> None:
-        self._control.servoStop()
-        self._control.teachMode()
-
-    def hold(self) -> None:
-        self._control.endTeachMode()
+    def age_s(self) -> float | None:
+        """Return None: the age of a new state is unknown, because the robot has its own clock."""
+        return None
 
     def _check_model(self, settings: StreamSettings, model: str, version: str) -> None:
         is_e_series = not version.startswith("3.")
@@ -182,9 +147,9 @@ class _RtdeConnection:
 
     def _check_modes(self, host: str) -> None:
         limit = time.monotonic() + FIRST_STATE_S
-        while self._receive.getTimestamp() == 0.0 and time.monotonic() < limit:
+        while self.receive.getTimestamp() == 0.0 and time.monotonic() < limit:
             time.sleep(0.005)
-        mode, safety = self._receive.getRobotMode(), self._receive.getSafetyMode()
+        mode, safety = self.receive.getRobotMode(), self.receive.getSafetyMode()
         if safety not in SAFE_MODES:
             name = STOP_NAMES.get(safety, f"safety mode {safety}").replace("_", " ")
             raise RobotError(f"the robot at {host} is in {name}: find the cause, then unlock it on the pendant")
@@ -193,10 +158,26 @@ class _RtdeConnection:
             raise RobotError(f"the robot at {host} is not running ({name}): power it on and release the brakes")
 
     def close(self) -> None:
-        if self._control is not None:
-            self._control.stopScript()
-            self._control.disconnect()
-        self._receive.disconnect()
+        if self.control is not None:
+            self.control.stopScript()
+            self.control.disconnect()
+        self.receive.disconnect()
+
+
+class Connection(Protocol):
+    """A connection to the arm; `receive` and `control` have the ur_rtde methods that the loop calls."""
+
+    rate_hz: float
+    receive: Any
+    control: Any
+
+    def age_s(self) -> float | None:
+        """Return the age of the newest state at its arrival [s]; None if the clocks cannot be compared."""
+        ...
+
+    def close(self) -> None:
+        """End the program and disconnect."""
+        ...
 
 
 def connect(settings: StreamSettings) -> Connection:
@@ -205,7 +186,7 @@ def connect(settings: StreamSettings) -> Connection:
         from rlservo.envs.ros2.arm import RosArmConnection
 
         return RosArmConnection(settings)
-    return _RtdeConnection(settings)
+    return _Connection(settings)
 
 
 class CommandStream:
@@ -220,11 +201,10 @@ class CommandStream:
         self._policy_velocities = velocities * settings.velocity_scale * self._limits.speed_scale
         self._start_velocities = np.minimum(velocities, self._limits.start_speed) * self._limits.speed_scale
         self._limiter = MotionLimiter(self._limits, simulation, self._policy_velocities, self._dt)
-        self._limiter.restart(connection.target())
+        self._limiter.restart(connection.receive.getTargetQ())
         self._goal, self._goal_due_s, self._number = self._limiter.position.copy(), 0.0, -1.0
         self._counts = np.zeros(len(COUNTED))
         self._phase, self._blend = Phase.HOLD, 0.0
-        self._reading = connection.read()
         self._robot_s, self._received_s, self._age_s = 0.0, time.monotonic(), 0.0
         self._delay = LinkDelay()
         self.is_asked_to_end = threading.Event()
@@ -255,20 +235,21 @@ class CommandStream:
 
     def _look(self, now: float) -> None:
         """Read the newest state and estimate its age: the link's delay beyond the usual one."""
-        self._reading = reading = self._robot.read()
-        if reading.time_s != self._robot_s:
-            excess_s = self._delay.excess_s(reading.time_s, now)
-            self._robot_s, self._received_s = reading.time_s, now
-            self._age_s = excess_s if reading.age_s is None else reading.age_s
+        robot_s = self._robot.receive.getTimestamp()
+        if robot_s != self._robot_s:
+            excess_s, known_s = self._delay.excess_s(robot_s, now), self._robot.age_s()
+            self._robot_s, self._received_s = robot_s, now
+            self._age_s = excess_s if known_s is None else known_s
 
     def _check(self) -> None:
-        reading, now = self._reading, time.monotonic()
-        if not reading.is_connected or now - self._received_s > LOST_S:
+        receive, now = self._robot.receive, time.monotonic()
+        if not receive.isConnected() or now - self._received_s > LOST_S:
             raise RobotError("connection_lost: no state from the controller for 1 s: check its cable and its pendant")
-        if reading.safety_mode not in SAFE_MODES:
-            name = STOP_NAMES.get(reading.safety_mode, "safety_stop")
+        safety = receive.getSafetyMode()
+        if safety not in SAFE_MODES:
+            name = STOP_NAMES.get(safety, "safety_stop")
             raise RobotError(f"{name}: find the cause, then unlock the robot on its pendant")
-        if not reading.is_program_running:
+        if not receive.getRobotStatus() & 2:
             silence_s = 1.0 / self._limits.watchdog_hz
             raise RobotError(
                 f"program_stopped: the controller's watchdog (no command for {silence_s:g} s) or its pendant ended it"
@@ -280,11 +261,13 @@ class CommandStream:
         self._limiter.limited[:] = False
         want, scale = self._wanted(orders, now, dt)
         if self._phase == Phase.FREE:
-            self._robot.keep_alive()
+            self._robot.control.kickWatchdog()
             return
         setpoint = self._limiter.step(want, dt, scale)
         began = time.monotonic()
-        is_taken = self._robot.send(setpoint)
+        is_taken = self._robot.control.servoJ(
+            setpoint.tolist(), 0.0, 0.0, self._dt, self._limits.lookahead_s, self._limits.gain
+        )
         if not is_taken or time.monotonic() - began > SLOW_CALL_S:
             self._look(time.monotonic())
             self._check()
@@ -294,7 +277,7 @@ class CommandStream:
         """Return the wanted velocity and the share of the limits that it may use; set the phase."""
         order, number = Order(int(orders["order"])), float(orders["number"])
         limiter, standstill = self._limiter, np.zeros(6)
-        fraction = min(max(self._reading.speed_fraction, 0.0), 1.0)
+        fraction = min(max(self._robot.receive.getTargetSpeedFraction(), 0.0), 1.0)
         if self.is_asked_to_end.is_set():
             return standstill, 1.0
         if (order == Order.FREE) != (self._phase == Phase.FREE):
@@ -324,11 +307,12 @@ class CommandStream:
     def _change_hands(self, to_person: bool) -> Vector:
         """Let a person lead the arm once it is at rest, or hold it again at its position."""
         if not to_person:
-            self._robot.hold()
-            self._limiter.restart(self._reading.positions)
+            self._robot.control.endTeachMode()
+            self._limiter.restart(self._robot.receive.getActualQ())
             self._phase = Phase.HOLD
         elif np.abs(self._limiter.velocity).max() < AT_REST:
-            self._robot.free()
+            self._robot.control.servoStop()
+            self._robot.control.teachMode()
             self._phase = Phase.FREE
         return np.zeros(6)
 
@@ -337,18 +321,18 @@ class CommandStream:
         self._phase = phase
 
     def _publish(self) -> None:
-        reading = self._reading
+        receive = self._robot.receive
         self._counts += self._limiter.limited
         self._report.write(
             {
                 "phase": self._phase,
                 "received_s": self._received_s,
-                "time_s": reading.time_s,
+                "time_s": self._robot_s,
                 "age_s": self._age_s,
-                "positions": reading.positions,
-                "velocities": reading.velocities,
-                "robot_mode": reading.robot_mode,
-                "safety_mode": reading.safety_mode,
+                "positions": receive.getActualQ(),
+                "velocities": receive.getActualQd(),
+                "robot_mode": receive.getRobotMode(),
+                "safety_mode": receive.getSafetyMode(),
                 "setpoint": self._limiter.position,
                 "blend": self._blend,
                 "written_s": time.monotonic(),

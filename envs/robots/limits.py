@@ -8,7 +8,7 @@ the new: both keep those limits, and so does every mixture. Joint positions come
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
@@ -110,7 +110,7 @@ class MotionLimiter:
         self._box_low, self._box_high = np.array(self.limits.box_low), np.array(self.limits.box_high)
         self._box_low, self._box_high = self._box_low + WALL_MARGIN, self._box_high - WALL_MARGIN
 
-    def restart(self, position: Vector) -> None:
+    def restart(self, position: Sequence[float]) -> None:
         """Restart at rest at measured joint positions [rad] (6,)."""
         self.position, self.velocity = np.array(position, dtype=np.float64), np.zeros(6)
 

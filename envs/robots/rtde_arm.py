@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.robots.arm import RUNNING, STOP_NAMES, ArmState, RobotError
+from rlservo.envs.robots.arm import STOP_NAMES, ArmState, RobotError
 from rlservo.envs.robots.command_stream import FAILED, ORDERS, READY, REPORT, Order, Phase, StreamSettings
 from rlservo.envs.robots.limits import COUNTED, Limits
 from rlservo.envs.robots.shared_block import SharedBlock, make_file
@@ -86,7 +86,7 @@ class RtdeArm:
             time_s=float(report["time_s"]),
             received_s=float(report["received_s"]),
             age_s=float(report["age_s"]),
-            mode="running" if mode == RUNNING else f"robot mode {mode}",
+            mode="running" if mode == 7 else f"robot mode {mode}",
             safety={1: "normal", 2: "reduced"}.get(safety) or STOP_NAMES.get(safety, f"safety mode {safety}"),
         )
 

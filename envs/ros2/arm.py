@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
-from functools import partial
+import threading
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.envs.robots.arm import RUNNING, Reading, RobotError
+from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.address import ARM_OPTIONS, COMMAND_TOPICS, RosAddress
-from rlservo.envs.ros2.link import check_clock, take_command, wait_for
+from rlservo.envs.ros2.link import FIRST_MESSAGES_S, check_clock, take_command, wait_until
 from rlservo.envs.ros2.messages import (
     FLAG,
     INT8,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rlservo.envs.robots.command_stream import StreamSettings
 
 RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of commands, if the limits name none
-MODES = ("program_running", "robot_mode", "safety_mode")
+RUNNING = 7
 # Distance of a joint from its setpoint beyond which it does not follow: at rest, plus this much of its velocity.
 FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
 AHEAD_S = 0.1  # of a trajectory's point: the controller begins each new one at the arm's lagging position
@@ -43,7 +43,7 @@ Vector = NDArray[np.float64]
 
 
 class RosArmConnection:
-    """The arm's topics, as a connection of the command stream."""
+    """The arm's topics, with the ur_rtde methods that the command stream calls."""
 
     def __init__(self, settings: StreamSettings) -> None:
         """Wait for every input, then take the command topic. Raises RobotError."""
@@ -53,26 +53,28 @@ class RosArmConnection:
         self._how = address["command"]
         self._limits = settings.limits
         self.rate_hz = settings.limits.rate_hz or RATE_HZ[self._how]
+        self.receive = self.control = self
         self._joints = [address["prefix"] + name for name in JOINT_NAMES.values()]
+        self._lock = threading.Lock()
         self._state: tuple[float, float | None, Vector, Vector] | None = None  # stamp, age, positions, velocities
         self._problem = f"no message on {address['joint_states']}: is the driver running, with this ROS_DOMAIN_ID"
         self._speed_percent = 100.0 if address["status"] == "off" else float("nan")
-        self._modes: dict[str, int] = dict(zip(MODES, (1, RUNNING, 1), strict=True))
-        self._topic = address["commands"] or COMMAND_TOPICS[self._how]
+        self._modes: dict[str, int] = {"program_running": 1, "robot_mode": RUNNING, "safety_mode": 1}
         self._setpoint: Vector | None = None
         self._fastest = 0.0  # [rad/s], of the latest setpoints
         self._guard: subprocess.Popen[bytes] | None = None
         self._link = RclpyLink("rlservo_arm")
         try:
             self._subscribe()
+            topic = address["commands"] or COMMAND_TOPICS[self._how]
             if self._how == "velocity":  # its controller repeats the last command indefinitely
-                words = [sys.executable, "-m", "rlservo.envs.ros2.velocity_guard", self._topic]
+                words = [sys.executable, "-m", "rlservo.envs.ros2.velocity_guard", topic]
                 self._guard = subprocess.Popen(
                     words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
                 )
-            self._publish = take_command(self._link, self._topic, KINDS[self._how])
+            self._publish = take_command(self._link, topic, KINDS[self._how])
             if self._guard is not None and self._guard.stdout is not None and not self._guard.stdout.readline():
-                raise RobotError(f"the guard of {self._topic} ended at its start: nothing is commanded without it")
+                raise RobotError(f"the guard of {topic} ended at its start: nothing is commanded without it")
         except BaseException:
             self.close()
             raise
@@ -84,24 +86,55 @@ class RosArmConnection:
             self._guard.stdin.close()
             self._guard.wait()
 
-    # -- the command stream's
-
-    def read(self) -> Reading:
-        """Return the newest state. With trajectories the controller applies the speed scaling itself."""
+    def age_s(self) -> float | None:
+        """Return the newest state's age at its arrival [s], by its stamp; None with the robot's own clock."""
         assert self._state is not None
-        modes, fraction = self._modes, 1.0 if self._how == "trajectory" else self._speed_percent / 100.0
-        return Reading(
-            *self._state, modes["robot_mode"], modes["safety_mode"], bool(modes["program_running"]), fraction
-        )
+        return self._state[1]
 
-    def target(self) -> Vector:
-        """Return the measured joint positions [rad] (6,)."""
+    # -- receive
+
+    def isConnected(self) -> bool:
+        """Return True: the age of the states is the better sign."""
+        return True
+
+    def getTimestamp(self) -> float:
+        """Return the newest state's stamp [s]."""
         assert self._state is not None
-        return self._state[2]
+        return self._state[0]
 
-    def send(self, goal: Vector) -> bool:
-        """Publish the next setpoint [rad] (6,). Raises RobotError if the arm does not follow."""
-        measured = self.target()
+    def getActualQ(self) -> list[float]:
+        """Return the joint positions [rad] (6,)."""
+        assert self._state is not None
+        return [float(value) for value in self._state[2]]
+
+    getTargetQ = getActualQ
+
+    def getActualQd(self) -> list[float]:
+        """Return the joint velocities [rad/s] (6,)."""
+        assert self._state is not None
+        return [float(value) for value in self._state[3]]
+
+    def getRobotMode(self) -> int:
+        """Return the robot mode, 7 if it runs."""
+        return self._modes["robot_mode"]
+
+    def getSafetyMode(self) -> int:
+        """Return the safety mode, 1 if it is normal."""
+        return self._modes["safety_mode"]
+
+    def getRobotStatus(self) -> int:
+        """Return ur_rtde's bits: 1 for power, 2 for a running program."""
+        return 1 + 2 * self._modes["program_running"]
+
+    def getTargetSpeedFraction(self) -> float:
+        """Return the speed scaling, 0 to 1. With trajectories the controller applies it itself."""
+        return 1.0 if self._how == "trajectory" else self._speed_percent / 100.0
+
+    # -- control
+
+    def servoJ(self, setpoint: Sequence[float], *_: float) -> bool:
+        """Publish the next setpoint [rad] (6,); return False if the arm does not follow."""
+        goal, measured = np.array(setpoint), np.array(self.getActualQ())
         before = goal if self._setpoint is None else self._setpoint
         velocity = (goal - before) * self.rate_hz
         self._setpoint = goal
@@ -112,28 +145,29 @@ class RosArmConnection:
             joint = self._joints[int(away.argmax())]
             raise RobotError(
                 f"not_following: {joint} is {away.max():.2f} rad from its setpoint: is the controller of "
-                f"{self._topic} active (ros2 control list_controllers)"
+                f"{self._address['commands'] or COMMAND_TOPICS[self._how]} active (ros2 control list_controllers)"
             )
         if self._how == "position":
             self._publish({"data": goal.tolist()})
         elif self._how == "velocity":
             self._publish({"data": (velocity + DRIFT_GAIN * (goal - measured) * bool(velocity.any())).tolist()})
-            self.keep_alive()
+            self.kickWatchdog()
         else:
             self._publish(self._trajectory(goal, velocity))
         return True
 
-    def keep_alive(self) -> None:
+    def kickWatchdog(self) -> None:
         """Feed the guard of velocity commands."""
         if self._guard is not None and self._guard.stdin is not None:
             self._guard.stdin.write(b".")
             self._guard.stdin.flush()
 
-    def free(self) -> None:
+    def servoStop(self) -> None:
         """Stop sending: the arm holds, and another node may command it."""
         self._setpoint = None
 
-    hold = free
+    teachMode = servoStop
+    endTeachMode = servoStop
 
     # -- parts
 
@@ -152,25 +186,28 @@ class RosArmConnection:
         if address["status"] == "on":
             self._modes.clear()
             link.subscribe(address["speed_scaling"], NUMBER, self._take_speed)
-            for name in MODES:
+            for name, own in (("program_running", FLAG), ("robot_mode", ""), ("safety_mode", "")):
                 topic = address[name]
-                publishers = wait_for(
-                    partial(link.publishers, topic),
+                wait_until(
+                    lambda topic=topic: bool(link.publishers(topic)),  # type: ignore[misc]  # a default is no argument
                     f"nothing publishes {topic}: is the driver's io_and_status_controller active (or use status=off)",
+                    FIRST_MESSAGES_S,
                 )
                 # ur_dashboard_msgs' own type, or a plain number if that package is not installed.
-                kind = FLAG if name == "program_running" else publishers[0].type or INT8
-                link.subscribe(topic, kind, partial(self._take_mode, name), is_kept=True)
-        wait_for(lambda: not self._missing(), self._missing)
-        check_clock(address["joint_states"], self.read().age_s or 0.0)
+                kind = own or link.publishers(topic)[0].type or INT8
+                link.subscribe(topic, kind, lambda message, name=name: self._take_mode(name, message), is_kept=True)  # type: ignore[misc]
+        wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
+        check_clock(address["joint_states"], self.age_s() or 0.0)
+
+    def _is_complete(self) -> bool:
+        return self._state is not None and len(self._modes) == 3 and self._speed_percent == self._speed_percent
 
     def _missing(self) -> str:
         if self._state is None:
             return self._problem
-        missing = [name for name in MODES if name not in self._modes]
-        missing += ["speed_scaling"] * math.isnan(self._speed_percent)
-        topics = ", ".join(self._address[name] for name in missing)
-        return f"no message on {topics} (status=off works without it)" if missing else ""
+        missing = [name for name in ("program_running", "robot_mode", "safety_mode") if name not in self._modes]
+        topics = [self._address[name] for name in missing or ["speed_scaling"]]
+        return f"no message on {', '.join(topics)} (status=off works without it)"
 
     def _take_state(self, message: Any) -> None:
         positions = in_order(message, self._joints, "position")

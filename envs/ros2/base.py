@@ -32,7 +32,7 @@ from rlservo.envs.robots.command_stream import Order, Phase
 from rlservo.envs.robots.limits import CheckedLimits
 from rlservo.envs.robots.link_delay import LinkDelay
 from rlservo.envs.ros2.address import BASE_OPTIONS, RosAddress
-from rlservo.envs.ros2.link import check_clock, open_link, take_command, wait_for
+from rlservo.envs.ros2.link import FIRST_MESSAGES_S, Endpoint, check_clock, open_link, take_command, wait_until
 from rlservo.envs.ros2.messages import (
     FLAG,
     LASER_SCAN,
@@ -138,7 +138,7 @@ class RosBase:
                 self._subscribe_scan(topic, pose)
             if address["deadman"]:
                 link.subscribe(address["deadman"], FLAG, self._take_deadman)
-            wait_for(lambda: not self._missing(), self._missing)
+            wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
             for topic, one in self._inputs.items():
                 check_clock(topic, one.age_s)
             self._is_stamped = self._find_twist() == TWIST_STAMPED
@@ -195,15 +195,19 @@ class RosBase:
             address["front_scan"]: scanner_pose(FRONT_SCANNER),
             address["back_scan"]: scanner_pose(BACK_SCANNER),
         }
+        found: dict[str, tuple[float, float, float]] = {}
 
-        def look() -> dict[str, tuple[float, float, float]]:
+        def look() -> bool:
             single = address["scan"] or "/scan"
             if not address["scan"] and all(self._link.publishers(topic) for topic in both):
-                return both
-            return {single: (0.0, 0.0, 0.0)} if self._link.publishers(single) else {}
+                found.update(both)
+            elif self._link.publishers(single):
+                found[single] = (0.0, 0.0, 0.0)
+            return bool(found)
 
         names = address["scan"] or f"{' and '.join(both)}, or /scan"
-        return wait_for(look, f"nothing publishes {names} (limit stop_distance=0 works without it)")
+        wait_until(look, f"nothing publishes {names} (limit stop_distance=0 works without it)", FIRST_MESSAGES_S)
+        return found
 
     def _subscribe_scan(self, topic: str, pose: tuple[float, float, float]) -> None:
         one = self._inputs[topic]
@@ -212,9 +216,12 @@ class RosBase:
     def _take_deadman(self, message: Any) -> None:
         self._deadman = (time.monotonic(), bool(message.data))
 
+    def _is_complete(self) -> bool:
+        return all(one.value is not None for one in self._inputs.values())
+
     def _missing(self) -> str:
         missing = [topic for topic, one in self._inputs.items() if one.value is None]
-        return f"no message with a stamp on {', '.join(missing)}: is the base's driver running" if missing else ""
+        return f"no message with a stamp on {', '.join(missing)}: is the base's driver running"
 
     def _find_twist(self) -> str:
         """Return the message type of the command topic: as set, or as its subscribers use it."""
@@ -222,8 +229,13 @@ class RosBase:
         if said != "auto":
             return TWIST_STAMPED if said == "TwistStamped" else TWIST
         topic = self.address["cmd_vel"]
-        nothing = f"nothing subscribes to {topic}: is the base's driver running"
-        found = wait_for(lambda: self._link.subscribers(topic), nothing)
+        found: list[Endpoint] = []
+
+        def look() -> bool:
+            found[:] = self._link.subscribers(topic)
+            return bool(found)
+
+        wait_until(look, f"nothing subscribes to {topic}: is the base's driver running", FIRST_MESSAGES_S)
         kinds = {one.type for one in found} & {TWIST, TWIST_STAMPED}
         if len(kinds) != 1:
             types = ", ".join(sorted({one.type for one in found}))

@@ -1,18 +1,14 @@
-"""Link to a ROS graph, through rclpy or a rosbridge: waiting for it, and taking a command topic."""
+"""Link to a ROS graph: the interface to rclpy or a rosbridge for the backends, the node and the simulators."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.address import RosAddress
-
-if TYPE_CHECKING:
-    from rlservo.envs.ros2.rclpy_link import RclpyLink
-    from rlservo.envs.ros2.rosbridge_link import RosbridgeLink
 
 SAID_AFTER_S = 10.0
 FIRST_MESSAGES_S = 30.0
@@ -22,11 +18,7 @@ LOOK_S = 0.02
 DISCOVERY_S = 4.0
 LEAVING_S = 1.0  # until an ended node has left the graph, or a new one's name is known
 
-Link: TypeAlias = "RclpyLink | RosbridgeLink"
-"""A connection to a graph: topics, and its other nodes. Callbacks run in a thread of their own, one at a time."""
 Publish = Callable[[Mapping[str, Any]], None]
-"""Publishes a message given as a dictionary."""
-T = TypeVar("T")
 log = logging.getLogger("rlservo.robot")
 
 
@@ -35,6 +27,42 @@ class Endpoint(NamedTuple):
 
     node: str
     type: str  # "geometry_msgs/msg/Twist"
+
+
+class Topics(Protocol):
+    """Topics of a graph. Callbacks run in a thread of their own, one at a time."""
+
+    def now_s(self) -> float:
+        """Return ROS's time [s]."""
+        ...
+
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
+        """Call `on_message` with each new message."""
+        ...
+
+    def advertise(self, topic: str, kind: str) -> Publish:
+        """Return a function that publishes a message given as a dictionary."""
+        ...
+
+    def close(self) -> None:
+        """Leave the graph."""
+        ...
+
+
+class Link(Topics, Protocol):
+    """A connection to the graph, which knows its other nodes."""
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """Return the publishers of other nodes."""
+        ...
+
+    def rivals(self, topic: str) -> list[Endpoint]:
+        """Return the publishers that compete for the topic."""
+        ...
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        """Return the subscribers of other nodes."""
+        ...
 
 
 def open_link(address: RosAddress, name: str) -> Link:
@@ -48,10 +76,10 @@ def open_link(address: RosAddress, name: str) -> Link:
     return RclpyLink(name)
 
 
-def wait_for(value: Callable[[], T], what: Callable[[], str] | str, timeout_s: float = FIRST_MESSAGES_S) -> T:
-    """Wait until a value is true, report that after 10 s, and return it. Raises RobotError if it takes longer."""
+def wait_until(condition: Callable[[], bool], what: Callable[[], str] | str, timeout_s: float) -> None:
+    """Wait for a condition, and report it after 10 s. Raises RobotError when it does not come true in time."""
     began, said = time.monotonic(), False
-    while not (found := value()):
+    while not condition():
         waited_s = time.monotonic() - began
         reason = what if isinstance(what, str) else what()
         if waited_s > timeout_s:
@@ -60,7 +88,6 @@ def wait_for(value: Callable[[], T], what: Callable[[], str] | str, timeout_s: f
             said = True
             log.warning("still waiting: %s", reason)
         time.sleep(LOOK_S)
-    return found
 
 
 def check_clock(topic: str, age_s: float) -> None:
@@ -85,7 +112,7 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
         return any(one.type == kind for one in link.subscribers(topic))
 
     try:
-        wait_for(is_listened_to, f"nothing subscribes to {topic} ({kind}): is its controller running", 20.0)
+        wait_until(is_listened_to, f"nothing subscribes to {topic} ({kind}): is its controller running", 20.0)
     except RobotError:
         types = {one.type for one in link.subscribers(topic)} - {kind}
         if types:

@@ -34,7 +34,8 @@ class _Client:
 
     def __init__(self, connection: ServerConnection) -> None:
         self.connection = connection
-        self.topics: dict[str, set[str]] = {"subscribe": set(), "advertise": set()}
+        self.subscribed: set[str] = set()
+        self.advertised: set[str] = set()
         self._waiting: dict[str, str] = {}
         self._changed = threading.Condition()
         self._is_closed = False
@@ -101,7 +102,7 @@ class RosbridgeServer:
 
         def publish(values: Mapping[str, Any]) -> None:
             with self._lock:
-                takers = [client for client in self._clients if topic in client.topics["subscribe"]]
+                takers = [client for client in self._clients if topic in client.subscribed]
             if takers:
                 text = json.dumps({"op": "publish", "topic": topic, "msg": values})
                 for client in takers:
@@ -138,10 +139,14 @@ class RosbridgeServer:
         try:
             request = json.loads(text)
             op, topic = request["op"], str(request.get("topic", ""))
-            if op in ("subscribe", "advertise"):
-                client.topics[op].add(topic)
-            elif op in ("unsubscribe", "unadvertise"):
-                client.topics[op.removeprefix("un")].discard(topic)
+            if op == "subscribe":
+                client.subscribed.add(topic)
+            elif op == "unsubscribe":
+                client.subscribed.discard(topic)
+            elif op == "advertise":
+                client.advertised.add(topic)
+            elif op == "unadvertise":
+                client.advertised.discard(topic)
             elif op == "publish":
                 if topic in self._takers:
                     self._takers[topic](parse(request["msg"]))
@@ -156,14 +161,13 @@ class RosbridgeServer:
     def _answer(self, client: _Client, request: Mapping[str, Any]) -> None:
         service, topic = str(request["service"]), str((request.get("args") or {}).get("topic", ""))
         with self._lock:
-            subscribed, advertised = (
-                [BRIDGE] * any(topic in one.topics[op] for one in self._clients) for op in ("subscribe", "advertise")
-            )
+            by_clients = {name: [BRIDGE] * any(topic in getattr(one, name) for one in self._clients)
+                          for name in ("advertised", "subscribed")}  # fmt: skip
         known: dict[str, dict[str, Any]] = {
             "/rosapi/topics": {"topics": list(self._types), "types": list(self._types.values())},
             "/rosapi/topic_type": {"type": self._types.get(topic, "")},
-            "/rosapi/publishers": {"publishers": [ROBOT] * (topic in self._published) + advertised},
-            "/rosapi/subscribers": {"subscribers": [ROBOT] * (topic in self._takers) + subscribed},
+            "/rosapi/publishers": {"publishers": [ROBOT] * (topic in self._published) + by_clients["advertised"]},
+            "/rosapi/subscribers": {"subscribers": [ROBOT] * (topic in self._takers) + by_clients["subscribed"]},
         }
         values = known.get(service)
         answer = {"op": "service_response", "id": request.get("id"), "service": service, "result": values is not None,

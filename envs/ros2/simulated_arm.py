@@ -16,6 +16,7 @@ from rlservo.envs.ros2.rclpy_link import RclpyLink, message_class
 from rlservo.envs.ros2.simulation_loop import FaultyLink
 from rlservo.envs.ur_controller.console import obey
 from rlservo.envs.ur_controller.controller import Controller, RobotMode, SafetyMode
+from rlservo.envs.ur_controller.server import Link as LinkFaults
 
 LOOKAHEAD_S = 0.1  # with the driver's own 0.03 s, every pause of a machine that is not real-time becomes a jump
 VELOCITY_ACCELERATION = 25.0  # [rad/s^2], of speedj for velocity commands
@@ -31,11 +32,11 @@ log = logging.getLogger("rlservo.robot")
 class SimulatedArm:
     """The arm with one active controller: position, velocity or trajectory."""
 
-    def __init__(self, ur_model: str, *, controller: str, prefix: str) -> None:
+    def __init__(self, ur_model: str, *, controller: str, prefix: str, faults: LinkFaults) -> None:
         """Join the graph. Raises RobotError without rclpy, ValueError for an unknown model."""
         self.controller = Controller(ur_model)
-        self.messages = FaultyLink()
-        self.link = self.messages.faults
+        self.link = faults
+        self.messages = FaultyLink(faults)
         self.dt = self.controller.dt
         self._joints = [prefix + JOINT_NAMES[name] for name in JOINT_NAMES]
         self._order = [list(JOINT_NAMES).index(name) for name in PUBLISHED_ORDER]

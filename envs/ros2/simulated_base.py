@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from rlservo.envs.mir100.parameters import (
 )
 from rlservo.envs.mir100.simulation import Mir100Simulation
 from rlservo.envs.ros2.address import BASE_OPTIONS
+from rlservo.envs.ros2.link import Topics
 from rlservo.envs.ros2.messages import (
     LASER_SCAN,
     ODOMETRY,
@@ -34,10 +35,7 @@ from rlservo.envs.ros2.messages import (
 )
 from rlservo.envs.ros2.simulation_loop import FaultyLink
 from rlservo.envs.ur_controller.console import obey_link
-
-if TYPE_CHECKING:
-    from rlservo.envs.ros2.rclpy_link import RclpyLink
-    from rlservo.envs.ros2.rosbridge_server import RosbridgeServer
+from rlservo.envs.ur_controller.server import Link as LinkFaults
 
 SUBSTEPS = 2  # of 0.01 s a tick: odometry at 50 Hz
 SCAN_TICKS = 4  # 12.5 Hz, as on the SICK S300
@@ -54,11 +52,11 @@ log = logging.getLogger("rlservo.robot")
 class SimulatedBase:
     """The base: its drive with a timeout and limits, and its scanners."""
 
-    def __init__(self, links: Sequence[RclpyLink | RosbridgeServer], *, world: str, is_stamped: bool) -> None:
+    def __init__(self, links: Sequence[Topics], *, world: str, is_stamped: bool, faults: LinkFaults) -> None:
         """Offer the topics on all links. Raises ValueError for an unknown world."""
         self.simulation = Mir100Simulation(world)
         self.simulation.place(STARTS.get(world, (0.0, 0.0, 0.0)))
-        self.messages = FaultyLink()
+        self.messages = FaultyLink(faults)
         self.dt = SUBSTEPS * TIMESTEP
         self._links, self._ticks = list(links), 0
         kinds = {"odom": ODOMETRY, "front_scan": LASER_SCAN, "back_scan": LASER_SCAN, "scan": LASER_SCAN}

@@ -4,30 +4,42 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from typing import Any, Protocol
 
 import numpy as np
 
 from rlservo.envs.ros2.link import Publish, safely
-from rlservo.envs.ur_controller.console import read_console
 from rlservo.envs.ur_controller.server import Link as LinkFaults
 
-if TYPE_CHECKING:
-    from rlservo.envs.ros2.simulated_arm import SimulatedArm
-    from rlservo.envs.ros2.simulated_base import SimulatedBase
-
 LONGEST_CATCH_UP_S = 0.5  # [s] of cycles that a delayed loop catches up
+
+
+class SimulatedRobot(Protocol):
+    """A robot driven by the loop; all calls come from the loop's thread."""
+
+    dt: float  # [s], of a control cycle
+    messages: FaultyLink
+
+    def tick(self) -> None:
+        """Let one control cycle pass and publish."""
+        ...
+
+    def obey(self, line: str) -> str:
+        """Carry out a line of the console and return what to print."""
+        ...
 
 
 class FaultyLink:
     """Messages in both directions, delayed or lost according to `faults`."""
 
-    def __init__(self) -> None:
-        self.faults = LinkFaults()
-        self._rng = np.random.default_rng(0)
+    def __init__(self, faults: LinkFaults, seed: int = 0) -> None:
+        self.faults = faults
+        self._rng = np.random.default_rng(seed)
         self._waiting: list[tuple[float, int, Callable[[], None]]] = []
         self._count = itertools.count()
         self._lock = threading.Lock()
@@ -71,11 +83,17 @@ class FaultyLink:
 
 
 def run(
-    robot: SimulatedArm | SimulatedBase, stop: threading.Event, on_ready: Callable[[], None], lines: Iterable[str] = ()
+    robot: SimulatedRobot, stop: threading.Event, on_ready: Callable[[], None], console: Iterable[str] = ()
 ) -> None:
-    """Run a robot in real time until `stop` is set, and obey the console's lines meanwhile, all in this thread."""
-    asked: list[Callable[[], object]] = []
-    read_console(lines, asked.append, robot.obey)
+    """Run a robot in real time until `stop` is set, and obey the console's lines meanwhile."""
+    lines: list[str] = []
+
+    def read_lines() -> None:
+        with suppress(OSError):  # its terminal is gone
+            for line in console:
+                lines.append(line)  # each as it comes
+
+    threading.Thread(target=read_lines, name="console", daemon=True).start()
     on_ready()
     due = time.monotonic()
     while not stop.is_set():
@@ -83,7 +101,10 @@ def run(
         if now < due:
             time.sleep(due - now)
         due = max(due + robot.dt, now - LONGEST_CATCH_UP_S)
-        while asked:
-            asked.pop(0)()
+        while lines:
+            line = lines.pop(0)
+            if line.strip() and (reply := robot.obey(line)):
+                sys.stdout.write(f"{reply}\n")
+                sys.stdout.flush()
         robot.messages.deliver()
         robot.tick()

@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 
-from rlservo.envs.ros2.link import wait_for
+from rlservo.envs.ros2.link import wait_until
 from rlservo.envs.ros2.messages import NUMBERS
 from rlservo.envs.ros2.rclpy_link import GUARD, RclpyLink
 
@@ -26,7 +26,7 @@ def main(topic: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     link = RclpyLink(GUARD)
     publish, is_fed = link.advertise(topic, NUMBERS), False  # advertised now, as a subscriber takes a while to find it
-    wait_for(lambda: link.subscribers(topic), f"nothing subscribes to {topic}", FIND_S)
+    wait_until(lambda: bool(link.subscribers(topic)), f"nothing subscribes to {topic}", FIND_S)
     time.sleep(SETTLE_S)
     os.write(1, READY)
     while True:

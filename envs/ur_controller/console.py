@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-import threading
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable
 from typing import Protocol
 
 from rlservo.envs.ur_controller.controller import Controller
@@ -29,24 +26,6 @@ slider 0.5         speed slider             remote, local  remote control on or 
 latency 20         link: ms each way        jitter 5       link: up to so many ms more
 drop 0.01          link: share of RTDE data packages lost
 down, up           link: cut and restored   state          where the arm is"""
-
-
-def read_console(
-    lines: Iterable[str], do: Callable[[Callable[[], object]], None], carry_out: Callable[[str], str]
-) -> None:
-    """Read lines in a thread of its own; `do` takes a function that carries one out and prints the reply."""
-
-    def read() -> None:
-        with suppress(OSError):  # its terminal is gone
-            for line in filter(str.strip, lines):
-                do(lambda line=line: show(carry_out(line)))  # type: ignore[misc]  # bound now
-
-    def show(reply: str) -> None:
-        if reply:
-            sys.stdout.write(f"{reply}\n")
-            sys.stdout.flush()
-
-    threading.Thread(target=read, name="console", daemon=True).start()
 
 
 def obey(server: Simulated, line: str) -> str:

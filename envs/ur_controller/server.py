@@ -16,8 +16,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import partial
 
 import numpy as np
 
@@ -231,12 +231,23 @@ class ControllerServer:
 
 def run(controller: Controller, host: str, link: Link, stop: threading.Event, on_ready: Callable[[], None]) -> None:
     """Serve until `stop` is set, and obey the lines on standard input meanwhile. Raises CannotListenError."""
-    from rlservo.envs.ur_controller.console import obey, read_console
+    from rlservo.envs.ur_controller.console import obey
 
     server = ControllerServer(controller, host=host, link=link)
+
+    def read_lines() -> None:
+        with suppress(OSError):  # its terminal is gone
+            for line in filter(str.strip, sys.stdin):
+                server.do(lambda line=line: print_reply(obey(server, line)))  # type: ignore[misc]
+
+    def print_reply(reply: str) -> None:
+        if reply:
+            sys.stdout.write(f"{reply}\n")
+            sys.stdout.flush()
+
     try:
         on_ready()
-        read_console(sys.stdin, server.do, partial(obey, server))
+        threading.Thread(target=read_lines, name="console", daemon=True).start()
         server.serve(stop)
     finally:
         server.close()

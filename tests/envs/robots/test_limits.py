@@ -44,7 +44,7 @@ def test_no_limit_is_passed_and_nothing_jumps(
     simulation, rng = URSimulation("ur5e", objects=()), np.random.default_rng(1)
     most = SCALE * np.array(simulation.parameters.velocity_limits)
     limiter = MotionLimiter(WALLS, simulation, most, 3 * DT)
-    limiter.restart(START)
+    limiter.restart(START.tolist())
     goal, before, tool_before = START, np.zeros(6), simulation.tool_at(START)[0]
     counted = np.zeros(len(COUNTED), dtype=np.bool_)
     travelled = 0.0
@@ -70,7 +70,7 @@ def test_arm_slows_down_along_a_wall_and_reaches_the_goal_beyond_as_far_as_it_ma
     simulation = URSimulation("ur5e", objects=())
     limits = Limits(position_high=(0.5, *Limits().position_high[1:]))
     limiter = MotionLimiter(limits, simulation, np.full(6, 1.0), DT)
-    limiter.restart(START)
+    limiter.restart(START.tolist())
     goal = limiter.goal_within(START + np.array([1.0, 0.2, 0.0, 0.0, 0.0, 0.0]))
     assert limiter.limited[COUNTED.index("position.base")]
     for _ in range(2000):

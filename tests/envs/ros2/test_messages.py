@@ -16,6 +16,7 @@ from rlservo.envs.ros2 import messages
 from rlservo.envs.ros2.address import ARM_OPTIONS, BASE_OPTIONS, RosAddress
 from rlservo.envs.ros2.base import BaseLimits
 from rlservo.envs.ros2.simulated_base import SimulatedBase
+from rlservo.envs.ur_controller.server import Link as LinkFaults
 from rlservo.export.contract.errors import UsageError
 
 
@@ -76,7 +77,7 @@ class Outlet:
 def scans() -> tuple[Mir100Simulation, dict[str, object]]:
     """Messages of the simulated base in the room, and the simulation itself."""
     outlet = Outlet()
-    base = SimulatedBase([outlet], world="lab_6x8", is_stamped=False)  # type: ignore[list-item]
+    base = SimulatedBase([outlet], world="lab_6x8", is_stamped=False, faults=LinkFaults())  # type: ignore[list-item]
     for _ in range(4):
         base.tick()
     return base.simulation, outlet.sent

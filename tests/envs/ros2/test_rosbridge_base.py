@@ -70,7 +70,7 @@ class RunningBase:
 def base(request: pytest.FixtureRequest) -> Iterator[RunningBase]:
     world, is_stamped = getattr(request, "param", ("empty", False))
     bridge = RosbridgeServer("127.0.0.1", 0)
-    running = RunningBase(SimulatedBase([bridge], world=world, is_stamped=is_stamped), bridge.port)
+    running = RunningBase(SimulatedBase([bridge], world=world, is_stamped=is_stamped, faults=LinkFaults()), bridge.port)
     tick = running.base.tick
     running.base.tick = lambda: (tick(), running.watch())[0]  # type: ignore[method-assign]
     command = running.base.simulation.command
