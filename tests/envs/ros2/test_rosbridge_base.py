@@ -20,7 +20,7 @@ from command_line import rlservo
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.robots.command_stream import Phase
 from rlservo.envs.ros2 import messages
-from rlservo.envs.ros2.base import BaseLimits, RosBase
+from rlservo.envs.ros2.base import AGE_BOUND_S, BaseLimits, RosBase
 from rlservo.envs.ros2.link import Endpoint, Publish
 from rlservo.envs.ros2.rosbridge_link import RosbridgeLink
 from rlservo.envs.ros2.rosbridge_server import RosbridgeServer
@@ -141,7 +141,8 @@ def test_base_stops_before_a_wall_and_may_turn_away(base: RunningBase) -> None:
             real.command(0.5, 0.0)
             time.sleep(0.05)
         front = base.base.simulation.pose[0] + 0.0376 + 0.45
-        assert 2.82 - 0.5 < front <= 2.82 - 0.3 + 0.02
+        # On a busy machine its inputs may be as old as it permits; for a tenth of a second of that it allows.
+        assert 2.82 - 0.5 < front <= 2.82 - 0.3 + 0.5 * (AGE_BOUND_S - 0.1)
         assert real.limited()["stop_distance"] > 0
         x = base.seen[-1][1]
         while base.seen[-1][1] > x - 0.1:
