@@ -7,7 +7,6 @@ is new. The reply is a line on standard output: the folder, how it ended, and wh
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import json
 import os
@@ -19,26 +18,14 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 EXAMPLES = HERE.parent / "examples"
 OWN_CODE = HERE / "examples" / "app"  # environments of some of the scripts
+sys.path[:0] = [str(EXAMPLES), str(HERE)]
 
-import forked_workers  # noqa: E402
+import shared.training_run as training_run  # noqa: E402
 
 import quick_rllib  # noqa: E402, F401
 
-for costly in ("gymnasium", "pandas", "pyarrow.dataset", "torch"):  # not Ray, which then reads its environment
-    importlib.import_module(costly)
-WORKERS = forked_workers.start()
-
-sys.path.insert(0, str(EXAMPLES))
-import shared.training_run as training_run  # noqa: E402  # before Ray
-
-import ray  # noqa: E402  # isort: skip
-
 
 def main() -> None:
-    start_ray = ray.init
-    ray.init = lambda *given, runtime_env, **more: start_ray(
-        *given, runtime_env=runtime_env | {"py_executable": WORKERS}, **more
-    )
     with training_run.ray_session(num_cpus=1, app_dir=OWN_CODE):
         training_run.ray_session = lambda **_: contextlib.nullcontext()  # the scripts' own
         for line in sys.stdin:

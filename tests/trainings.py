@@ -88,7 +88,6 @@ PRODUCT = ("export", "envs", "serve_app/runtime", "serve_app/wire", "serve_app/r
 TESTS_OWN = (
     "trainings.py",
     "train_in_one_ray.py",
-    "forked_workers.py",
     "quick_rllib.py",
     "examples/app",
     "examples/train_edges.py",
