@@ -6,6 +6,7 @@ Importing rich takes as long as everything else that `rlservo --help` needs.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import shlex
 import signal
@@ -55,6 +56,12 @@ def output() -> Console:
 def errors() -> Console:
     """Return the console for errors, progress and notes, which a program that reads our output should not see."""
     return _console(stderr=True)
+
+
+def show_log() -> None:
+    """Print rlservo's own log with the time of each line; of other packages only warnings."""
+    logging.basicConfig(format="%(asctime)s %(message)s")
+    logging.getLogger("rlservo").setLevel(logging.INFO)
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,7 +67,7 @@ def cockpit(
         raise UsageError("--record needs --url or --bundle")
     arguments = parse_env_arguments(env_arg or [])
     if "robot" in arguments:  # prints a line per change of its state
-        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+        terminal.show_log()
     with needs_extra("cockpit"):
         from rlservo.deploy.cockpit.run import run_drive, run_playback, run_watch
 

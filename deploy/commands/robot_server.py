@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.environment_options import parse_env_arguments, require_robot
-from rlservo.deploy.terminal import Json, print_json
+from rlservo.deploy.terminal import Json, print_json, show_log
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra
 
@@ -309,7 +308,7 @@ def _serve(settings: Settings, title: str) -> None:
 @contextmanager
 def _one_sentence_errors() -> Iterator[None]:
     """Convert the simulators' errors to those of the command line, and name a missing extra."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    show_log()
     try:
         with needs_extra("sim", "mujoco", "grpc"):
             yield

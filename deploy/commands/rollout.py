@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,7 +10,7 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.environment_options import choose_gl_backend, parse_env_arguments, require_robot
-from rlservo.deploy.terminal import Json, print_json
+from rlservo.deploy.terminal import Json, print_json, show_log
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.extras import needs_extra, require
 
@@ -85,7 +84,7 @@ def rollout(
     arguments = parse_env_arguments(env_arg or []) | ({"confirm": False} if yes else {})
     if "robot" in arguments:
         require_robot(str(arguments["robot"]))
-        logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+        show_log()
     if video is not None:
         choose_gl_backend()
     if record is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 import threading
@@ -67,7 +66,7 @@ def ros2(
     """
     if (url is None) == (bundle is None):
         raise UsageError("expected either --url (a server) or --bundle (in process)")
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    terminal.show_log()
     _pass_ros_arguments(ros_args or [], mapping)
     with needs_extra("sim", "mujoco", "gymnasium"):
         from rlservo.deploy.ros2.node import PolicyNode, drive_elements, drive_environment, real_environment
@@ -122,7 +121,7 @@ def ros2_sim(
     """
     if robot == "mir100" and not ros and rosbridge_port is None:
         raise UsageError("--no-ros needs --rosbridge-port: otherwise the robot has no link")
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    terminal.show_log()
     with needs_extra("sim", "mujoco"):
         from rlservo.envs.robots.arm import RobotError
         from rlservo.envs.ros2.simulation_loop import SimulatedRobot, run

@@ -45,7 +45,7 @@ NO_OSMESA = {"PYOPENGL_PLATFORM": "egl"}  # MuJoCo refuses OSMesa then
 
 def in_a_process(mode: str, display: str | None = None, **variables: str) -> list[str]:
     """Draw twice where MUJOCO_GL is unset, and return what was printed."""
-    hidden = ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY")
+    hidden = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "DISPLAY", "WAYLAND_DISPLAY")  # the second is set by MuJoCo's EGL
     environment = {name: value for name, value in os.environ.items() if name not in hidden} | variables
     if display is not None:
         environment["DISPLAY"] = display
