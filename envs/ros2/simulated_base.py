@@ -43,6 +43,7 @@ MERGED_BEAMS = 720  # of /scan, all around base_link
 STARTS = {"lab_6x8": (0.0, 2.6, 0.0)}  # [m], [m], [rad], clear of the cubes
 HELP = """\
 place 1 0 3.14     put the robot at: x, y, yaw  state          where it is
+cube 0 1 -0.5 0.3  put a cube at: x, y, yaw
 latency 20         link: ms each way                   jitter 5       up to so many ms more
 drop 0.01          link: share of messages lost        down, up       link: cut and restored"""
 
@@ -102,10 +103,13 @@ class SimulatedBase:
         if word == "state":
             pose = " ".join(f"{value:.3f}" for value in self.simulation.pose)
             return f"pose {pose}, velocity {self.simulation.velocity[0]:.4f} {self.simulation.velocity[1]:.4f}"
-        if word != "place":
+        if word not in ("place", "cube"):
             return obey_link(self.messages.faults, line)
         try:
-            self.simulation.place([float(one) for one in rest])
+            if word == "place":
+                self.simulation.place([float(one) for one in rest])
+            else:
+                self.simulation.move_cube(int(rest[0]) if rest else -1, [float(one) for one in rest[1:]])
         except ValueError as error:
             return f"{line.strip()[:100]!r}: {error}"
         return ""

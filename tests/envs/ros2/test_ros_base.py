@@ -61,7 +61,6 @@ def test_policy_succeeds_through_topics_as_often_as_in_the_simulator(
 ) -> None:
     env = gym.make(f"rlservo.envs:rlservo/{env_id}", disable_env_checker=True)
     simulation: Any = env.unwrapped.simulation  # type: ignore[attr-defined]
-    options = {"cubes": simulation.world.cubes} if world != "empty" else {}
     policy = Policy.load(all_shipped / name / "1")
     outcomes: Counter[tuple[str, str]] = Counter()
     with policy, closing(env), closing(Ros()) as graph:
@@ -71,10 +70,12 @@ def test_policy_succeeds_through_topics_as_often_as_in_the_simulator(
         node = graph.rlservo("ros2", "--bundle", all_shipped / name, "--unproven", "--autostart")
         node.wait_for("check -> ready")
         for seed in range(EPISODES):
-            observation, _ = env.reset(seed=seed, options=options)
+            observation, _ = env.reset(seed=seed)
             policy.reset()
             start, (x, y, _) = simulation.pose, simulation.target
             graph.wait_until(lambda: graph.speed() < STANDS)
+            for index, cube in enumerate(simulation.cubes):
+                sim.type(" ".join(map(str, ("cube", index, *cube))))
             sim.type("place " + " ".join(map(str, start)))
             graph.wait_until(lambda start=start: position(graph) == pytest.approx(start[:2], abs=1e-3))
             is_over, info = False, {}

@@ -131,6 +131,17 @@ def test_obstacle_environment_sees_what_the_simulated_one_sees(base: RunningBase
         env.close()
 
 
+def test_robot_and_cubes_are_put_where_a_console_says() -> None:
+    base = SimulatedBase([], world="lab_6x8", is_stamped=False, faults=LinkFaults())
+    *others, _ = base.simulation.cubes
+    assert base.obey("cube 2 1.9 -0.25 0.5") == ""
+    assert base.obey("place 1 2.5 0.5") == ""
+    assert base.simulation.cubes == [*others, (1.9, -0.25, 0.5)]
+    assert base.simulation.pose == pytest.approx((1.0, 2.5, 0.5))
+    assert "cube 3 does not exist" in base.obey("cube 3 0 0 0")
+    assert "expected three finite numbers" in base.obey("cube 0 1 nan 0")
+
+
 @pytest.mark.parametrize("base", [("lab_6x8", False)], indirect=True)
 def test_base_stops_before_a_wall_and_may_turn_away(base: RunningBase) -> None:
     real = RosBase(base.robot, limits=BaseLimits(stop_distance=0.3, blend_s=0.0))
