@@ -60,16 +60,14 @@ def list_policies(
         _print_repository(listing)
         return
     with _client(url, key_file) as client:
-        replicas = client.replicas()
-        shown = {replica["replica"] for replica in replicas}
-        others = {process: number for process, number in client.plans().items() if process not in shown}
+        shown = client.listing()
+        others = {process: number for process, number in client.plans().items() if process != shown["replica"]}
     if as_json:
-        print_json([*replicas, *({"replica": process, "generation": number} for process, number in others.items())])
+        print_json([shown, *({"replica": process, "generation": number} for process, number in others.items())])
         return
-    for replica in replicas:
-        terminal.output().print(_table(replica))
-        for sentence in replica["behind"]:
-            terminal.output().print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
+    terminal.output().print(_table(shown))
+    for sentence in shown["behind"]:
+        terminal.output().print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
     for process, number in others.items():
         terminal.output().print(f"process {process}: plan {number}", markup=False, highlight=False)
 

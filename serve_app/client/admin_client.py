@@ -27,11 +27,6 @@ class AdminClient(Closeable):
         # Not retried: a change whose answer was lost would be made twice.
         self._transport = Transport(url, timeout_s=timeout_s, retries=0, api_key=api_key)
 
-    def replicas(self) -> list[dict[str, Any]]:
-        """Return every replica's listing, as its `GET /v1/policies` would."""
-        listings: list[dict[str, Any]] = self._transport.get("v1", "admin", "policies")
-        return listings
-
     def listing(self) -> dict[str, Any]:
         """Return the answering process's listing, as `GET /v1/policies`."""
         listing: dict[str, Any] = self._transport.get("v1", "policies", timeout_s=LOOK_TIMEOUT_S)

@@ -18,7 +18,6 @@ from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
 from rlservo.serve_app.protocols.request_fields import encode_json, parse_json
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route
-from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import OK
 from rlservo.serve_app.server.request_handler import RequestHandler
@@ -39,9 +38,6 @@ def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
         after = await control.give(command, name)
         entry.code, entry.generation = OK, after.generation
         return after
-
-    async def status(_call: Call) -> tuple[bytes, Headers]:
-        return encode_json([listing.describe(handler)]), JSON_HEADERS
 
     def commanded(command: str) -> Answer:
         async def answer(call: Call) -> tuple[bytes, Headers]:
@@ -66,7 +62,6 @@ def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
     admin, model = "/v1/admin/policies", "/v2/repository/models/{name}"
     load, unload = "Load a model's newest version", "Unload all versions of a model"
     return [
-        Route(GET, admin, Access.admin, "List of the policies and versions served by the answering process", status),
         *(
             Route(POST, f"{admin}/{{name}}/{command}", Access.admin, kind.summary, commanded(command))
             for command, kind in COMMANDS.items()

@@ -136,7 +136,6 @@ DESCRIBED: dict[tuple[str, str], tuple[Any, Any]] = {
     ("POST", "/v2/models/{name}/infer"): (InferRequest, InferReply),
     ("GET", "/v1/policies"): (None, PolicyList),
     ("GET", "/v1/policies/{name}"): (None, Contract),
-    ("GET", "/v1/admin/policies"): (None, list[PolicyList]),
     **{("POST", f"/v1/admin/policies/{{name}}/{name}"): (kind, Changed) for name, kind in COMMANDS.items()},
     **{(method.verb, method.path): (None, _reply_of(name, method.field)) for name, method in METHODS.items()},
 }

@@ -44,7 +44,6 @@ BODY = b'{"obs": [0], "version": "1", "alias": "production"}'
 OBS = b'{"obs": [0]}'
 COMMANDS = ("load", "unload", "alias", "rollback", "canary", "shadow")
 ADMIN_PATHS = (
-    "/v1/admin/policies",
     *(f"/v1/admin/policies/{{name}}/{command}" for command in COMMANDS),
     "/v2/repository/models/{name}/load",
     "/v2/repository/models/{name}/unload",
@@ -434,7 +433,7 @@ def test_every_command_is_in_the_audit_whatever_became_of_it_and_no_key_is(
     file = tmp_path / "audit.jsonl"
     settings = ServerSettings(
         api_keys=f"{ROBOT_LINE},{ADMIN_LINE}", audit_file=str(file), log_level="error",
-        log_file=str(tmp_path / "server.jsonl"), body_timeout_s=0.3,
+        log_file=str(tmp_path / "server.jsonl"), body_timeout_s=0.3, record=str(tmp_path),
     )  # fmt: skip
     attempts = [
         (b"alias", b'{"alias": "candidate", "version": "2"}', "ok"),
@@ -458,8 +457,8 @@ def test_every_command_is_in_the_audit_whatever_became_of_it_and_no_key_is(
                 wire.ask(b"POST", b"/v1/admin/policies/ur5/" + command, *bearer(ADMIN), body=body)
             wire.ask(b"POST", b"/v1/admin/policies/" + ADMIN.encode() + b"/load", *bearer(ADMIN), body=b"{}")
             wire.ask(b"PUT", b"/v1/admin/policies/ur5/load", *bearer(ADMIN))
-            wire.ask(b"GET", b"/v1/admin/policies", *bearer(ROBOT))
-            wire.ask(b"GET", b"/v1/admin/policies", *bearer(ADMIN))  # changes nothing
+            wire.ask(b"GET", b"/v1/admin/recordings", *bearer(ROBOT))
+            assert wire.ask(b"GET", b"/v1/admin/recordings", *bearer(ADMIN))[0] == 200  # changes nothing
             wire.ask(b"POST", b"/v1/admin/policies/ur5/load", b"x-request-id: " + ADMIN.encode())
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert [line["code"] for line in lines] == [

@@ -130,7 +130,7 @@ def test_the_listing_says_what_runs_since_when_and_how_much(port: int, admin: Ad
     assert one["loaded_at"].startswith("20") and one["loaded_at"].endswith("+00:00")
     _, whole = ask(port, "GET", "/v1/policies")
     assert (whole["replica"], whole["generation"], whole["changed_by"]) == ("only", 2, "alias ur5 production=2")
-    assert admin.replicas() == [whole]
+    assert admin.listing() == whole
 
 
 def test_a_refused_version_is_told_in_the_listing_and_the_index(port: int, admin: AdminClient) -> None:
@@ -211,12 +211,12 @@ def test_a_policy_unloaded_and_loaded_again_is_served_and_knows_its_way_back(
 
 def test_administration_needs_the_key_and_acting_does_not(port: int) -> None:
     assert act(port)["version"] == "1"
-    for path in ("/v1/admin/policies", "/v1/admin/policies/ur5/load", "/v2/repository/models/ur5/load"):
+    for path in ("/v1/admin/recordings", "/v1/admin/policies/ur5/load", "/v2/repository/models/ur5/load"):
         status, reply = ask(port, "POST" if "load" in path else "GET", path, {} if "load" in path else None)
         assert (status, reply["code"]) == (401, "unauthenticated")
     stranger, _ = new_key("stranger", admin=True)
     with AdminClient(f"http://127.0.0.1:{port}", api_key=stranger) as client, pytest.raises(UnauthenticatedError):
-        client.replicas()
+        client.recordings()
 
 
 def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, served: Serve, tmp_path: Path) -> None:

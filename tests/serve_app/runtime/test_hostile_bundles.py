@@ -118,7 +118,7 @@ def work_goes_on(admin: AdminClient, url: str) -> None:
             lambda: admin.shadow("ur5", "candidate"),
             lambda: admin.shadow("ur5", None),
             lambda: admin.alias("ur5", "candidate", None),
-            admin.replicas,
+            admin.listing,
         ):
             began = time.monotonic()
             command()
