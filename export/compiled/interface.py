@@ -60,7 +60,7 @@ def interface_of(contract: Contract) -> Interface:
     """Return the interface. Raises UnsupportedError for types that C lacks and for too many elements."""
     names = Identifiers(("scratch", "values", "unused", REWARD))
     obs = [*_leaves(leaf_specs(contract.observation_space, "obs"), names)]
-    if any(tensor.name == REWARD for tensor in contract.inputs):
+    if contract.has_reward:
         first = sum(member.size for member in obs)
         obs.append(Member(REWARD, REWARD, np.dtype(np.float32), 1, first))
     action = [*_leaves(leaf_specs(contract.action_space, "action"), names)]

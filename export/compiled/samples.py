@@ -20,7 +20,7 @@ def sample_inputs(
     """Yield `steps` times ROWS observations (and rewards) by tensor name; always the same for one contract."""
     rng = np.random.default_rng(0)
     leaves: dict[str, LeafSpec] = leaf_specs(contract.observation_space, "obs")
-    if any(tensor.name == REWARD for tensor in contract.inputs):
+    if contract.has_reward:
         leaves = {**leaves, REWARD: BoxSpec(shape=(1,), dtype="float32", low=None, high=None, elements=())}
     for _ in range(steps):
         kinds = rng.choice(6, ROWS, p=[0.4, 0.25, 0.15, 0.1, 0.05, 0.05])

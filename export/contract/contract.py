@@ -157,6 +157,11 @@ class Contract(FrozenModel):
     parity: Parity
     evaluations: tuple[Evaluation, ...] = ()
 
+    @property
+    def has_reward(self) -> bool:
+        """Whether the policy was trained to see the last action's reward."""
+        return any(tensor.name == REWARD for tensor in self.inputs)
+
 
 def version_key(version: str) -> tuple[int, ...]:
     """Return a sort key: '3' counts as 3.0.0."""

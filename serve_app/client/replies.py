@@ -91,7 +91,7 @@ def answering_version(url: str, reply: Any, number: int, contract: Contract) -> 
 def check_successor(contract: Contract, known: Contract) -> None:
     """Refuse a version whose observations or actions differ from those of the known one."""
     parts = [
-        {"observation": each.observation_space, "action": each.action_space, REWARD: _sees_reward(each)}
+        {"observation": each.observation_space, "action": each.action_space, REWARD: each.has_reward}
         for each in (contract, known)
     ]
     differing = [name for name, part in parts[0].items() if part != parts[1][name]]
@@ -102,10 +102,6 @@ def check_successor(contract: Contract, known: Contract) -> None:
             "new client, or one with version=",
             {"version": contract.version, "known": known.version, "differing": differing},
         )
-
-
-def _sees_reward(contract: Contract) -> bool:
-    return any(tensor.name == REWARD for tensor in contract.inputs)
 
 
 def check_step(reply: Mapping[str, Any], steps: int) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from rlservo.export.contract.contract import REWARD, Contract
+from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import ActionError, UsageError
 from rlservo.export.contract.nested import build_action
 from rlservo.serve_app.recording.episodes import Episode, episodes
@@ -88,7 +88,7 @@ class Follower:
 
     def _follow(self, episode: Episode) -> FollowedEpisode:
         policy = self._policy_of(episode.policy)
-        if not policy.is_stateful and all(tensor.name != REWARD for tensor in policy.contract.inputs):
+        if not policy.is_stateful and not policy.contract.has_reward:
             at_once = _follow_at_once(policy, episode)
             if at_once is not None:
                 return at_once
@@ -102,7 +102,7 @@ class Follower:
         if policy.is_stateful:
             end = _end_of_memory(episode, before, last)
             known[end:] = False
-        rewarded = any(tensor.name == REWARD for tensor in policy.contract.inputs)
+        rewarded = policy.contract.has_reward
         space, seen = policy.contract.observation_space, episode.obs
         executed = episode.executed
         moved = episode.acted | episode.fell_back

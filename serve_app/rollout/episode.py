@@ -59,7 +59,7 @@ def run_episode(
 
     Raises UsageError when the environment fails, and whatever `policy.act` raises, preceded by episode and step.
     """
-    has_reward = any(tensor.name == REWARD for tensor in policy.contract.inputs)
+    has_reward = policy.contract.has_reward
     draws = np.random.default_rng(seed)  # one seed per exploring action; unused otherwise
     policy.reset()
     obs, _ = _call(env.reset, index, 0, seed=seed)

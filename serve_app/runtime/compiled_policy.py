@@ -112,7 +112,7 @@ class CompiledLibrary:
         self._policy = contract.name
         observed, acted = leaf_specs(contract.observation_space, "obs"), leaf_specs(contract.action_space, "action")
         obs = [(name, leaf.dtype, leaf.shape) for name, leaf in observed.items()]
-        if any(tensor.name == REWARD for tensor in contract.inputs):
+        if contract.has_reward:
             obs.append((REWARD, "float32", ()))
         # numpy lays structs out as C does. The state begins with the remembered values; working memory follows.
         self._structs = (

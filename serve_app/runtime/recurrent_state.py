@@ -26,7 +26,7 @@ class StateTensors:
     def __init__(self, contract: Contract) -> None:
         self._policy = contract.name
         self._specs: dict[str, StateSpec] = {state.name: state for state in contract.state}
-        self.has_reward = any(tensor.name == REWARD for tensor in contract.inputs)
+        self.has_reward = contract.has_reward
         self._choices = contract.action_space if isinstance(contract.action_space, DiscreteSpec) else None
         self.outputs = [f"state_out.{name}" for name in self._specs]
         """The graph's outputs needed besides the action."""
