@@ -25,7 +25,7 @@ from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 FIRST_WAIT_S = 0.05  # before the second attempt; doubled each time
 LONGEST_WAIT_S = 2.0
-FIRST_BYTES = 65536
+READ_BYTES = 65536  # of a stream, at once
 MAX_REPLY_BYTES = 64 << 20  # far above any action or contract; a wrong URL must not fill the memory
 KEEPALIVE_S = 5.0  # that an idle connection is kept
 SCHEMES = {"http": "http", "https": "https"}
@@ -36,10 +36,6 @@ Headers = Sequence[tuple[bytes, bytes]]
 
 class BrokenError(UnavailableError):
     """The connection is missing or closed, so there is no answer."""
-
-
-class DroppedError(BrokenError):
-    """The server closed the connection before it answered."""
 
 
 class Transport:
@@ -131,7 +127,7 @@ class Transport:
                 response, content = self.exchange(method, target, headers, body, deadline)
             except BrokenError as error:
                 failure: UnavailableError = error
-                if attempt == 0 and isinstance(error, DroppedError):
+                if attempt == 0 and isinstance(error.__cause__, DROPS):
                     wait = 0.0  # a server that closed an idle connection is probably still running
             else:
                 if response.status < 300:
@@ -176,7 +172,7 @@ class Transport:
             is_left_open = False
             try:
                 if response.status == 101:
-                    first = response.extensions["network_stream"].read(FIRST_BYTES)
+                    first = response.extensions["network_stream"].read(READ_BYTES)
                     is_left_open = True
                     return response, first
                 return response, self._read(response, deadline)
@@ -188,10 +184,9 @@ class Transport:
         except TIMEOUTS as error:
             raise DeadlineError(f"{self.url} did not answer within {budget_s:.3g} s") from error
         except FAILURES as error:
+            what = "dropped the connection" if isinstance(error, DROPS) else "cannot be reached"
             why = str(error) or type(error).__name__
-            if isinstance(error, DROPS):
-                raise DroppedError(f"{self.url} dropped the connection: {why}", {"url": self.url}) from error
-            raise BrokenError(f"{self.url} cannot be reached: {why}", {"url": self.url}) from error
+            raise BrokenError(f"{self.url} {what}: {why}", {"url": self.url}) from error
 
     def _read(self, response: httpcore.Response, deadline: float) -> bytes:
         content = b""

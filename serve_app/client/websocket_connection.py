@@ -15,12 +15,9 @@ from websockets.frames import Frame, Opcode
 from websockets.uri import parse_uri
 
 from rlservo.export.contract.errors import DeadlineError
-from rlservo.serve_app.client.http_transport import BrokenError, Transport
+from rlservo.serve_app.client.http_transport import MAX_REPLY_BYTES, READ_BYTES, BrokenError, Transport
 from rlservo.serve_app.client.replies import decode_error
 from rlservo.serve_app.wire.http_deadlines import send_all, time_left
-
-MAX_FRAME_BYTES = 64 << 20  # larger than any action or contract
-RECEIVE_BYTES = 65536
 
 
 class WebSocket:
@@ -32,7 +29,7 @@ class WebSocket:
         Raises BrokenError, DeadlineError, or what the server names.
         """
         self._url = url = transport.url
-        self._protocol = ClientProtocol(parse_uri(f"{url}{path}"), max_size=MAX_FRAME_BYTES)
+        self._protocol = ClientProtocol(parse_uri(f"{url}{path}"), max_size=MAX_REPLY_BYTES)
         offered = self._protocol.connect().headers.raw_items()
         headers = [(name.encode(), value.encode()) for name, value in offered if name != "Host"]
         self._response, first = transport.exchange("GET", path, headers, None, deadline)
@@ -78,7 +75,7 @@ class WebSocket:
                         return content.decode("utf-8", "replace") if frames[0].opcode is Opcode.TEXT else content
             try:
                 self._socket.settimeout(time_left(deadline))
-                if data := self._socket.recv(RECEIVE_BYTES):
+                if data := self._socket.recv(READ_BYTES):
                     self._protocol.receive_data(data)
                 else:
                     self._protocol.receive_eof()

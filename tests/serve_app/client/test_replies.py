@@ -16,7 +16,7 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.serve_app.client.http_transport import DroppedError  # noqa: F401 - one that inherits its code
+from rlservo.serve_app.client.http_transport import BrokenError  # noqa: F401 - one that inherits its code
 from rlservo.serve_app.client.replies import decode_error, error_of
 from rlservo.serve_app.protocols.error_statuses import error_answer
 
