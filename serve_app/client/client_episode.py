@@ -32,7 +32,8 @@ class ClientEpisode:
     def reset(self) -> None:
         """Start an episode."""
         self._state: dict[str, Any] | None = {}  # of the last reply; None if the version that gave it has none
-        self._steps = 0
+        self.steps = 0
+        """Actions of the episode."""
         self._last_action: Any = None
         self._is_last_action_known = True  # whether the server has the same action
         self._is_lost = False
@@ -47,12 +48,7 @@ class ClientEpisode:
 
     def reconnect(self) -> None:
         """Note a new connection, which has no memory of the episode."""
-        self._is_lost = self._steps > 0
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether there was an action since `reset`."""
-        return self._steps > 0
+        self._is_lost = self.steps > 0
 
     def request_fields(self, contract: Contract, batch: tuple[int, ...], *, ends: bool = False) -> dict[str, Any]:
         """Return the next request's fields on the episode, `ends` if it reports the end.
@@ -65,11 +61,11 @@ class ClientEpisode:
         if self._is_on_server(contract):
             if self._is_lost:
                 raise SessionLostError("the connection broke and the episode's memory was lost: call reset()")
-            fields["reset"] = self._steps == 0
+            fields["reset"] = self.steps == 0
             if not self._is_stream:
                 if self._is_id_spent:
                     self._session_id = uuid.uuid4().hex
-                self._is_id_spent = self._steps == 0
+                self._is_id_spent = self.steps == 0
                 fields["session_id"] = self._session_id
                 fields |= {"end": True} if ends else {}
         elif self._state is not None:
@@ -93,11 +89,11 @@ class ClientEpisode:
         self._is_id_spent = False
         if not self._is_on_server(contract):
             self._state = next_state(reply, contract)
-            self._steps += 1
+            self.steps += 1
         elif contract.state or "session_step" in reply:
-            self._steps = check_step(reply, self._steps)
+            self.steps = check_step(reply, self.steps)
         else:
-            self._steps += 1
+            self.steps += 1
         # The loop may write into its own.
         self._last_action = action.copy() if isinstance(action, np.ndarray) else copy.deepcopy(action)
         self._is_last_action_known = True

@@ -162,7 +162,7 @@ class RemotePolicy(ActingPolicy):
         end = {"final_status": (final_status or word)[:LONGEST_STATUS], "truncated": truncated and not terminated}
         try:
             request, batch = self._encode_request(final_obs, explore=False, seed=None, reward=None)
-            if self._episode.has_begun:
+            if self._episode.steps:
                 deadline = time.monotonic() + self._deadline_ms / 1e3
                 reply = self._exchange({**request, **end}, batch, deadline)
                 answering_version(self.url, reply, request["seq"], self._contract)
