@@ -15,17 +15,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from prometheus_client.parser import text_string_to_metric_families
-from pydantic import ConfigDict
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
 
 PLAN, LOADED = "rlservo_plan_generation", "rlservo_policy_loaded"
 ANSWERS, OUTCOMES, ENDS = "rlservo_request_seconds_bucket", "rlservo_requests_total", "rlservo_episode_ends_total"
 DIFFERENCES, MISSED = "rlservo_shadow_difference_bucket", "rlservo_shadow_missed_total"
-COUNTED = {  # the labels that distinguish a policy's series; those of other labels are summed
+READ = {  # the labels that distinguish a policy's series; those of other labels are summed
+    PLAN: (),
+    LOADED: ("version",),
     ANSWERS: ("version", "le"),
     OUTCOMES: ("version", "code"),
     ENDS: ("version", "outcome"),
@@ -39,44 +40,39 @@ class UntrustedError(UsageError):
     """The metrics contradict themselves or an earlier check."""
 
 
-@dataclass
-class Process:
-    """One process of a server, as its metrics show it."""
-
-    plan: float = 0  # number of the plan that it follows
-    versions: set[str] = field(default_factory=set)  # of the policy, loaded
-    numbers: Numbers = field(default_factory=dict)
-
-
-def read_metrics(text: str, policy: str) -> dict[str, Process]:
-    """Return the processes in a text for Prometheus, by name. Raises UntrustedError, and UnavailableError for none."""
-    processes: dict[str, Process] = {}
+def read_metrics(text: str, policy: str) -> dict[str, Numbers]:
+    """Return each process's numbers in a text for Prometheus. Raises UntrustedError, and UnavailableError for none."""
+    processes: dict[str, Numbers] = {}
     try:
         families = text_string_to_metric_families(text)
         for name, labels, value, *_ in (sample for family in families for sample in family.samples):
-            if name != PLAN and (name not in (LOADED, *COUNTED) or labels["policy"] != policy):
-                continue
-            process = processes.setdefault(labels.get("replica", ""), Process())
-            if name == PLAN:
-                process.plan = value
-            elif name == LOADED:
-                process.versions.add(labels["version"])
-            elif not 0 <= value < math.inf:
-                raise UntrustedError(f"{name} {labels} is {value}")
-            else:
-                path = "/".join((name, *(labels[label] for label in COUNTED[name])))
-                process.numbers[path] = process.numbers.get(path, 0.0) + value
+            if name in READ and (name == PLAN or labels["policy"] == policy):
+                if not 0 <= value < math.inf:
+                    raise UntrustedError(f"{name} {labels} is {value}")
+                numbers = processes.setdefault(labels.get("replica", ""), {})
+                path = "/".join((name, *(labels[label] for label in READ[name])))
+                numbers[path] = numbers.get(path, 0.0) + value
     except (ValueError, KeyError) as error:
         raise UntrustedError(f"the metrics cannot be read: {error!r}") from None
     if not processes:
         raise UnavailableError(f"the metrics have no series for policy '{policy}'")
-    for replica, process in processes.items():
-        for version in process.versions:
-            counts = [count for _, count in buckets(process.numbers, ANSWERS, version)]
-            answered = process.numbers.get(f"{OUTCOMES}/{version}/ok", 0.0)
+    for replica, numbers in processes.items():
+        for version in group(numbers, LOADED):
+            counts = [count for _, count in buckets(numbers, ANSWERS, version)]
+            answered = numbers.get(f"{OUTCOMES}/{version}/ok", 0.0)
             if counts != sorted(counts) or answered > max(counts, default=0.0):
                 raise UntrustedError(f"replica '{replica}' reports contradictory counts for version {version}")
     return processes
+
+
+def check_lag(processes: Mapping[str, Numbers], generation: int, version: str) -> None:
+    """Raise UnavailableError if a process follows an older plan or has not loaded the version."""
+    for name, numbers in processes.items():
+        plan = numbers.get(PLAN, 0)
+        if plan < generation:
+            raise UnavailableError(f"replica '{name}' follows plan {plan:g}, not yet {generation}")
+        if f"{LOADED}/{version}" not in numbers:
+            raise UnavailableError(f"replica '{name}' has not loaded version {version}")
 
 
 def group(numbers: Mapping[str, float], *path: str) -> Numbers:
@@ -94,15 +90,14 @@ def buckets(numbers: Mapping[str, float], *path: str) -> list[tuple[float, float
 class Counts:
     """Sums over all processes since a promotion began."""
 
-    __pydantic_config__ = ConfigDict(extra="forbid")  # when it is read from a log
-    total: Numbers = field(default_factory=dict)
-    seen: dict[str, Numbers] = field(default_factory=dict)
+    total: Numbers
+    seen: dict[str, Numbers]
     """Each process' own numbers when it was last seen."""
 
-    def add(self, processes: Mapping[str, Process]) -> None:
+    def add(self, processes: Mapping[str, Numbers]) -> None:
         """Add what was counted since the last look. Raises UntrustedError."""
-        for name, process in processes.items():
-            now = process.numbers
+        for name, numbers in processes.items():
+            now = {path: count for path, count in numbers.items() if not path.startswith((PLAN, LOADED))}
             before = self.seen.get(name, now)
             for path in {**before, **now}:
                 grown = now.get(path, 0.0) - before.get(path, 0.0)
@@ -211,6 +206,6 @@ def _unsuccessful(total: Numbers, version: str) -> tuple[float, float]:
 
 def _beyond(total: Numbers, limit: float, *path: str) -> tuple[float, float, float]:
     """Return (bound, cases above it, all cases) of a histogram: its largest bound within the limit."""
-    counted = buckets(total, *path)
-    bound, within = max((each for each in counted if each[0] <= limit), default=(0.0 if counted else limit, 0.0))
-    return bound, (counted[-1][1] if counted else 0.0) - within, counted[-1][1] if counted else 0.0
+    counted = buckets(total, *path) or [(limit, 0.0)]
+    (bound, within), cases = max((each for each in counted if each[0] <= limit), default=(0.0, 0.0)), counted[-1][1]
+    return bound, cases - within, cases

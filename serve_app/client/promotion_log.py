@@ -31,17 +31,16 @@ class PromotionLog:
     @contextlib.contextmanager
     def open(cls, path: Path) -> Iterator[PromotionLog]:
         """Open a log, made if it is not there. Raises UsageError if it is not a log or another process writes it."""
-        try:
-            file = path.open("a+b", buffering=0)
-        except OSError as error:
-            raise UsageError(f"the log {path} cannot be written: {error.strerror}") from None
-        with file:
+        with contextlib.ExitStack() as stack:
             try:
+                file = stack.enter_context(path.open("a+b", buffering=0))
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
+            except BlockingIOError:
                 raise UsageError(
                     f"another 'rlservo policy promote' is writing {path}: wait for it, or stop it"
                 ) from None
+            except OSError as error:
+                raise UsageError(f"the log {path} cannot be written: {error.strerror}") from None
             file.seek(0)
             try:
                 yield cls(path, file)

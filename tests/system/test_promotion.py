@@ -22,7 +22,7 @@ import pytest
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.promotion_evidence import read_metrics
+from rlservo.serve_app.client.promotion_evidence import PLAN, read_metrics
 from servers import Run, free_ports, running, wait_until_served
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -62,7 +62,7 @@ class Server:
     def wait_until_all_follow(self, plan: int) -> None:
         deadline = time.monotonic() + PATIENCE_S
         with self.admin() as admin:
-            while [each.plan for each in read_metrics(admin.metrics(), "ur5").values()] != [plan] * WORKERS:
+            while [each[PLAN] for each in read_metrics(admin.metrics(), "ur5").values()] != [plan] * WORKERS:
                 assert time.monotonic() < deadline
                 time.sleep(0.1)
 

@@ -11,12 +11,13 @@ from rlservo.serve_app.client.promotion_evidence import (
     ANSWERS,
     DIFFERENCES,
     ENDS,
+    LOADED,
     MISSED,
     OUTCOMES,
+    PLAN,
     Counts,
     Figure,
     Limits,
-    Process,
     UntrustedError,
     figures,
     interval,
@@ -106,12 +107,12 @@ def test_actions_that_are_apart_or_could_not_be_computed_count_against_it() -> N
     assert left_out.lacks and left_out.cases == 0
 
 
-def counted(**replicas: float) -> dict[str, Process]:
-    return {name: Process(numbers={"a": count}) for name, count in replicas.items()}
+def counted(**replicas: float) -> dict[str, dict[str, float]]:
+    return {name: {"a": count, PLAN: 10 - count, f"{LOADED}/2": 0.0} for name, count in replicas.items()}
 
 
 def test_counts_are_increments_over_processes_that_come_and_go() -> None:
-    counts = Counts()
+    counts = Counts({}, {})
     for look in ({"a": 100, "b": 50}, {"a": 110, "b": 60}, {"a": 112}, {"a": 112, "c": 7}, {"b": 61, "c": 9}):
         counts.add(counted(**look))
     assert counts.total == {"a": 10 + 10 + 2 + 1 + 2}  # b was out of sight; c counts from its first look
@@ -131,9 +132,10 @@ rlservo_requests_total{code="ok",policy="other",protocol="json",replica="r",vers
 
 
 def test_metrics_are_summed_over_protocols_for_each_process() -> None:
-    (process,) = read_metrics(TEXT + TEXT.replace('"ur5"', '"other"'), "ur5").values()
-    assert (process.plan, process.versions) == (7, {"2"})
-    assert process.numbers == {f"{OUTCOMES}/2/ok": 7, f"{ANSWERS}/2/0.01": 7, f"{ANSWERS}/2/+Inf": 8}
+    other = "\n".join(line for line in TEXT.replace('"ur5"', '"other"').splitlines() if PLAN not in line)
+    (process,) = read_metrics(TEXT + other + "\n", "ur5").values()
+    counts = {f"{OUTCOMES}/2/ok": 7, f"{ANSWERS}/2/0.01": 7, f"{ANSWERS}/2/+Inf": 8}
+    assert process == {PLAN: 7, f"{LOADED}/2": 0, **counts}
     with pytest.raises(UnavailableError, match="have no series for policy 'ur5'"):
         read_metrics("python_info 1.0\n", "ur5")
 
@@ -146,6 +148,7 @@ def test_metrics_are_summed_over_protocols_for_each_process() -> None:
         ('version="2"} 7.0', 'version="2"} -1.0'),
         (',version="2"} 3.0', "} 3.0"),
         ("} 3.0", "} NaN"),
+        ("} 7.0\nrlservo_policy", "} NaN\nrlservo_policy"),
         ("} 3.0", "} +Inf"),
         ("} 3.0", "} three"),
     ],
