@@ -269,7 +269,10 @@ class Promotion:
         try:
             generation = int(listing["generation"])
             changed = f"the last change was '{listing['changed_by']}', at {listing['changed_at'][:19]} UTC"
-            policies: dict[str, dict[str, Any]] = {each["name"]: dict(each) for each in listing["policies"]}
+            read = ("versions", "version", "canary", "shadow")
+            policies: dict[str, dict[str, Any]] = {
+                each["name"]: {field: each[field] for field in read} for each in listing["policies"]
+            }
         except (KeyError, TypeError, ValueError) as error:
             raise UnavailableError(f"the server's listing cannot be read ({error!r})") from None
         if generation < self._state.generation:  # of a worker or replica that has not followed yet

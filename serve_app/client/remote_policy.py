@@ -1,9 +1,4 @@
-"""Base of the HTTP and the WebSocket client of a policy: all but how a request for an action travels.
-
-A client without a version asks by the policy's name and follows the version that answers: the alias `production`, or a
-canary's share. A recurrent policy stays with the version that began the episode (the server ensures that), and an
-answer from a version with other spaces is never used.
-"""
+"""Base of the HTTP and the WebSocket client of a policy: all but how a request for an action travels."""
 
 from __future__ import annotations
 
