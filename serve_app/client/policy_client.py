@@ -35,11 +35,6 @@ class PolicyClient(RemotePolicy):
     With `label`, the server's recording names its requests between two `reset`s as one episode of that label.
     """
 
-    def reset(self) -> None:
-        """Start an episode: the next request carries it. Sends nothing."""
-        super().reset()
-        self._renew_label()
-
     def _send(self, request: dict[str, Any], batch: tuple[int, ...], deadline: float) -> Any:
         contract, left_s = self.contract, deadline - time.monotonic()
         version = () if self._version is None else ("versions", contract.version)

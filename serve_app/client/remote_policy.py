@@ -156,10 +156,10 @@ class RemotePolicy(ActingPolicy):
         word = "truncated" if truncated else "terminated"
         end = {"final_status": (final_status or word)[:LONGEST_STATUS], "truncated": truncated and not terminated}
         try:
-            request, batch = self._encode_request(final_obs, explore=False, seed=None, reward=None)
+            request, batch = self._encode_request(final_obs, reward=self._reward, **end)
             if self._episode.steps:
                 deadline = time.monotonic() + self._deadline_ms / 1e3
-                reply = self._exchange({**request, **end}, batch, deadline)
+                reply = self._exchange(request, batch, deadline)
                 answering_version(self.url, reply, request["seq"], self._contract)
         except RlservoError as error:
             logger.warning("the end of the episode was not reported to %s: %s", self.url, error.message)
@@ -180,6 +180,8 @@ class RemotePolicy(ActingPolicy):
         """Start an episode. Nothing is sent until the next request."""
         self._episode.reset()
         self._reward = None
+        if not self._is_stream:  # which has the label that it was opened with
+            self._renew_label()
         # A version number needs no lookup.
         self._looks_up = self._version not in (None, self._contract and self._contract.version)
         if self._recording is not None:
@@ -214,7 +216,8 @@ class RemotePolicy(ActingPolicy):
         """Request the action, and keep the reply as `last_reply`."""
         _ = self.contract  # the first contact has its own time-out
         deadline = time.monotonic() + self._deadline_ms / 1e3
-        request, batch = self._encode_request(obs, explore=explore, seed=seed, reward=reward)
+        reward = self._reward if reward is None else np.asarray(reward)
+        request, batch = self._encode_request(obs, explore=explore or None, seed=seed, reward=reward)
         reply = self._exchange(request, batch, deadline)
         contract = self._answering_contract(reply, request["seq"], deadline)
         action = decode_action(reply, batch, contract)
@@ -306,21 +309,11 @@ class RemotePolicy(ActingPolicy):
                     raise UnavailableError(f"{error.message}: the action was dropped", error.details) from error
                 time.sleep(ASK_AGAIN_S)
 
-    def _encode_request(
-        self, obs: Observation, *, explore: bool, seed: int | None, reward: ArrayLike | None
-    ) -> tuple[dict[str, Any], tuple[int, ...]]:
-        """Return (the arguments of `act` as fields of a numbered request, the batch axis as () or (B,))."""
+    def _encode_request(self, obs: Observation, **fields: Any) -> tuple[dict[str, Any], tuple[int, ...]]:
+        """Return (a numbered request with those fields that are given, the batch axis as () or (B,))."""
         encoded, batch = encode_observation(obs, self.contract)
-        request: dict[str, Any] = {"obs": encoded, "seq": next(self._numbers)}
-        if explore:
-            request["explore"] = True
-        if seed is not None:
-            request["seed"] = seed
-        if reward is not None:
-            request["reward"] = np.asarray(reward)
-        elif self._reward is not None:
-            request["reward"] = self._reward
-        return request, batch
+        given = {name: value for name, value in fields.items() if value is not None}
+        return {"obs": encoded, "seq": next(self._numbers), **given}, batch
 
 
 def _only_policy(listing: Any) -> str:
