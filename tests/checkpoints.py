@@ -41,7 +41,8 @@ def trained(script: str) -> Path:
     def train(folder: Path) -> None:
         # With the token in its environment Ray writes none to the user's home.
         environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
-        environment["RAY_enable_worker_prestart"] = "0"  # everything here trains in one process
+        for prestart in ("enable_worker_prestart", "prestart_worker_first_driver"):
+            environment[f"RAY_{prestart}"] = "0"  # everything here trains in one process
         command = [sys.executable, "-W", "ignore", str(code / script), str(folder)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
         assert done.returncode == 0, done.stderr[-3000:]

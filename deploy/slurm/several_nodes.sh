@@ -20,7 +20,8 @@ ray=("$python" -m ray.scripts.scripts) # the command 'ray', whatever the path
 cores="${SLURM_CPUS_PER_TASK:?ask for the cores of each node with --cpus-per-task}"
 gpus="${SLURM_GPUS_ON_NODE:-0}"
 
-export RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0 RAY_enable_worker_prestart=0
+export RAY_AUTH_MODE=token RAY_USAGE_STATS_ENABLED=0
+export RAY_enable_worker_prestart=0 RAY_prestart_worker_first_driver=0
 # In the environment only: srun passes it on, and no file or command line shows it.
 RAY_AUTH_TOKEN="$("$python" -c 'import secrets; print(secrets.token_hex(32))')"
 export RAY_AUTH_TOKEN

@@ -11,6 +11,7 @@ import os
 os.environ.setdefault("RAY_AUTH_MODE", "token")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("RAY_AIR_NEW_OUTPUT", "0")
-# Ray would start a worker process for each core beforehand; none of them has the runtime environment of `ray_session`,
-# so that it would wait in vain.
+# Ray would start a worker process for each core when a driver connects, and for tasks that wait; none of them has the
+# runtime environment of `ray_session` or of Tune's trials, so that it would wait in vain.
 os.environ.setdefault("RAY_enable_worker_prestart", "0")
+os.environ.setdefault("RAY_prestart_worker_first_driver", "0")

@@ -18,7 +18,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(16), RAY_enable_worker_prestart="0")
+os.environ.update(
+    RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(16),
+    RAY_enable_worker_prestart="0", RAY_prestart_worker_first_driver="0",
+)  # fmt: skip
 
 import ray
 from ray.cluster_utils import Cluster
