@@ -6,33 +6,40 @@ The last line it prints is JSON: how each run ended, and its output.
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
+import runpy
 import secrets
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-os.environ.update(
-    RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(16),
-    RAY_enable_worker_prestart="0", RAY_prestart_worker_first_driver="0",
-)  # fmt: skip
-
-import ray
-from ray.cluster_utils import Cluster
-
 TRAINER = Path(__file__).resolve().parents[2] / "examples" / "simple_trainer.py"
+sys.path.insert(0, str(TRAINER.parent))
+import shared.ray_settings  # noqa: E402, F401  # before Ray
+
+os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(16))  # a trainer's process imports this module, too
+
+import ray  # noqa: E402
+from ray.cluster_utils import Cluster  # noqa: E402
+
+# A trainer's process is forked from one that has imported RLlib, which takes longer than any of the three trains.
+FORKED = multiprocessing.get_context("forkserver")
+FORKED.set_forkserver_preload(["quick_rllib", "ray.rllib.algorithms.ppo", "ray.tune"])
 NODE_GROUP = "RAY_NODE_TYPE_NAME"  # what an autoscaler sets for the nodes it starts
 
 
 def main(folder: Path) -> None:
     results: dict[str, Any] = {}
-    Path("/tmp/ray").mkdir(exist_ok=True)  # Cluster writes its address there, whatever its own folder (ray 2.60)
+    Path(tempfile.gettempdir(), "ray").mkdir(
+        exist_ok=True
+    )  # Cluster writes its address there, whatever its own folder (ray 2.60)
     temporary = tempfile.mkdtemp(prefix="grow-", dir="/tmp")
     cluster = Cluster(
         initialize_head=True, head_node_args={"num_cpus": 2, "temp_dir": temporary, "include_dashboard": False}
@@ -51,23 +58,32 @@ def main(folder: Path) -> None:
     print(json.dumps(results))
 
 
+def run_trainer(output: Connection, folder: Path, *arguments: str) -> None:
+    for number in (1, 2):
+        os.dup2(output.fileno(), number)
+    os.chdir(folder)
+    sys.argv = [str(TRAINER), *arguments]
+    runpy.run_path(str(TRAINER), run_name="__main__")
+
+
 class Trainer:
     """A trainer with this many environment runners; each has a core, and so has its driver."""
 
     def __init__(self, cluster: Cluster, folder: Path, runners: int, *more: str) -> None:
-        command = [
-            sys.executable, str(TRAINER), "--address", cluster.address, "--num-cpus", str(runners), "--stop-iters", "5",
+        arguments = (
+            "--address", cluster.address, "--num-cpus", str(runners), "--stop-iters", "5",
             "--set", "train_batch_size_per_learner=400", "--hidden", "16", "--checkpoint-frequency", "1",
             "--episodes", "1", "--set", "env_runner_health_probe_timeout_s=5", *more,
-        ]  # fmt: skip
-        self.process = subprocess.Popen(
-            command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        )
+        )  # fmt: skip
+        read, written = FORKED.Pipe(duplex=False)
+        self.process = FORKED.Process(target=run_trainer, args=(written, folder, *arguments))
+        self.process.start()
+        written.close()
+        self.output = os.fdopen(os.dup(read.fileno()))
         self.said = ""
 
     def lines(self) -> Iterator[str]:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+        for line in self.output:
             self.said += line
             yield line
 
@@ -83,16 +99,17 @@ class Trainer:
 
     def end(self) -> dict[str, Any]:
         try:
-            rest, _ = self.process.communicate(timeout=240)
+            self.process.join(timeout=240)
         finally:
             self.process.kill()
-            self.process.wait()
-        return {"code": self.process.returncode, "said": self.said + rest}
+            self.process.join()
+        return {"code": self.process.exitcode, "said": self.said + self.output.read()}
 
 
 def interrupted(trainer: Trainer) -> dict[str, Any]:
     trainer.seconds_until("waiting for")
-    trainer.process.send_signal(signal.SIGINT)
+    assert trainer.process.pid is not None
+    os.kill(trainer.process.pid, signal.SIGINT)
     return trainer.end()
 
 
