@@ -71,8 +71,8 @@ IN_ONE_RAY = {
     ),
     "judged": _again(
         "mir100_obstacle_avoidance",
-        "stop.env_steps=5000", "stop.episodes=3", "validation.above=0", "validation.episodes=2",
-        "training.train_batch_size_per_learner=2048", "training.num_epochs=1",
+        "stop.env_steps=2500", "stop.episodes=3", "validation.above=0", "validation.episodes=2", "envs=8",
+        "training.train_batch_size_per_learner=1024", "training.num_epochs=1",
     ),
     "begun": _again(
         "ur5_positioning_disturbed",
