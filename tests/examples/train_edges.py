@@ -21,9 +21,13 @@ import simple_trainer
 from rlservo import errors
 from trainings import ON_ONE_CORE
 
+EVERY_300_STEPS = ("--set", "min_sample_timesteps_per_iteration=300")  # a result, where no batch is one
 RUNS = {
     "Float64": ["--set", "vf_clip_param=100.0", "--observation-filter", "MeanStdFilter"],
-    "Promises32": ["--run", "DQN", "--stop-timesteps", "1000"],
+    "Promises32": [
+        "--run", "DQN", "--stop-timesteps", "300", *EVERY_300_STEPS,
+        "--set", "num_steps_sampled_before_learning_starts=200",
+    ],
     "Camera": [],
     "Endless": [],
     "Crashing": ["--restart-failed-sub-environments", "--set", "rollout_fragment_length=25"],
@@ -38,7 +42,7 @@ RUNS = {
     "Failing evaluation": [
         "--env-arg", "fails=false", "--evaluation-interval", "1", "--evaluation-num-env-runners", "1", *ON_ONE_CORE,
     ],
-    "Float64 unlearned": ["--run", "SAC", "--stop-timesteps", "300"],
+    "Float64 unlearned": ["--run", "SAC", "--stop-timesteps", "300", *EVERY_300_STEPS],
 }  # fmt: skip
 
 
