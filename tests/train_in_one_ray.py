@@ -15,14 +15,14 @@ import sys
 import traceback
 from pathlib import Path
 
+import quick_rllib  # noqa: F401  # before RLlib
+
 HERE = Path(__file__).resolve().parent
 EXAMPLES = HERE.parent / "examples"
 OWN_CODE = HERE / "examples" / "app"  # environments of some of the scripts
 sys.path[:0] = [str(EXAMPLES), str(HERE)]
 
 import shared.training_run as training_run  # noqa: E402
-
-import quick_rllib  # noqa: E402, F401
 
 
 def main() -> None:
