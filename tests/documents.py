@@ -108,7 +108,7 @@ class Shell:
     machine: tuple[str, ...] = ()
     """The words that run a command on a machine of its own (`namespaces.own_machine`)."""
     one_ray: OneRay | None = None
-    """Runs the scripts of `examples/`, which would take longer to start than to train."""
+    """Runs Python blocks, scripts of `examples/` and exports: to import RLlib takes longer than most of them."""
     ports: dict[str, str] = field(init=False)
     """Free ports for the printed ones, which are free on a machine of its own."""
     terminals: dict[subprocess.Popen[bytes], int] = field(default_factory=dict)
@@ -126,15 +126,16 @@ class Shell:
         """Run a block; return its output. Its last command may stay: it is waited for until it has begun."""
         if block.language == "python":
             (self.folder / "block.py").write_text(self._with_ports(block.text))
-            return self._finish("python block.py")
+            line = f"python {self.folder / 'block.py'}"
+            return self._run_in_one_ray(line) if self.one_ray else self._finish(line)
         lines = re.sub(r" *\\\n *", " ", block.text).splitlines(keepends=True)
         stays = STAYS.match(lines[-1]) if lines else None
         done = lines[:-1] if stays else lines
         assert not any(map(STAYS.match, done)), f"pasted, the first command keeps the terminal:\n{block.text}"
         out = ""
-        for trains, part in groupby(done, self._trains):
+        for shared, part in groupby(done, self._is_for_one_ray):
             script = "".join(line for line in part if not NOT_HERE.match(line))
-            out += "".join(map(self._train, script.splitlines())) if trains else self._finish(script)
+            out += "".join(map(self._run_in_one_ray, script.splitlines())) if shared else self._finish(script)
         if stays:
             self._stay(stays[1], lines[-1].partition(" #")[0].strip())
         return out
@@ -206,12 +207,13 @@ class Shell:
         assert started.returncode == 0, f"{script}\n{self._printed('output')}"
         return self._printed("output")
 
-    def _trains(self, line: str) -> bool:
-        return self.one_ray is not None and line.startswith("python examples/")
+    def _is_for_one_ray(self, line: str) -> bool:
+        return self.one_ray is not None and line.startswith(("python examples/", "rlservo export "))
 
-    def _train(self, line: str) -> str:
+    def _run_in_one_ray(self, line: str) -> str:
         assert self.one_ray is not None
-        _python, script, *arguments = shlex.split(line, comments=True)
+        command = re.sub("^rlservo ", f"python {Path(sys.executable).with_name('rlservo')} ", line)
+        _python, script, *arguments = shlex.split(command, comments=True)
         ended = self.one_ray.run(self.folder, script.removeprefix("examples/"), *arguments).ended
         assert ended.code == 0, f"{line}\n{ended.out}{ended.err}"
         return ended.out

@@ -1,4 +1,4 @@
-"""The tutorial and the guides that train: their blocks run in order, as printed; scripts of `examples/` in one Ray."""
+"""The tutorial and the guides that train: their blocks run in order, as printed; trainings and exports in one Ray."""
 
 from __future__ import annotations
 
@@ -50,4 +50,4 @@ def test_guide_to_online_learning_runs_as_printed(
     shutil.copytree(shipped / "ur5", tmp_path / "policies" / "ur5")
     (checkpoint,) = tutorial[1].glob("runs/PPO-*/*/checkpoint_*")
     shutil.copytree(checkpoint, tmp_path / "runs" / "ppo" / "checkpoint")
-    ran(HOW_TO / "learn-online.md", tmp_path)
+    ran(HOW_TO / "learn-online.md", tmp_path, one_ray=one_ray)
