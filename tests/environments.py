@@ -74,19 +74,28 @@ def environment_with(wheel: Path, folder: Path, *extras: str) -> Path:
             tree = wheel.parent / UNPACKED
             _link(tree, site, [file.relative_to(tree) for file in tree.rglob("*") if file.is_file()])
         else:
-            files = [Path(file) for file in distribution.files or () if ".." not in file.parts]
-            tops = {file.parts[0] for file in files if file.parts[1:] == ("__init__.py",)}
-            packages = {top for top in tops if not (site / top).exists()}  # some share one
             root = Path(str(distribution.locate_file("."))).absolute()
-            for package in packages:
-                (site / package).symlink_to(root / package)
-            _link(root, site, [file for file in files if file.parts[0] not in packages])
+            for top, files in _files(distribution.name).items():
+                if Path(top, "__init__.py") in files and not (site / top).exists():  # some share a package
+                    (site / top).symlink_to(root / top)
+                else:
+                    _link(root, site, files)
         for point in distribution.entry_points.select(group="console_scripts"):
             script = folder / "bin" / point.name
             program = f"import sys\nfrom {point.module} import {point.attr}\nsys.exit({point.attr}())\n"
             script.write_text(f"#!{folder / 'bin' / 'python'}\n{program}")
             script.chmod(0o755)
     return folder
+
+
+@functools.cache
+def _files(name: str) -> dict[str, set[Path]]:
+    """Return an installed distribution's files by the folder, or the file, that they are below in site-packages."""
+    files: dict[str, set[Path]] = {}
+    for file in map(Path, metadata.files(name) or ()):
+        if ".." not in file.parts:
+            files.setdefault(file.parts[0], set()).add(file)
+    return files
 
 
 def _link(root: Path, site: Path, files: Iterable[Path]) -> None:

@@ -53,16 +53,24 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "robot-server ur --host 203.0.113.7": ("sim",),
     "demo --out out": ("all", "client", "serve", "train", "sim"),
 }
-EXTRAS = sorted(set(metadata.metadata("rlservo").get_all("Provides-Extra") or ()) - {"dev", "all"})
+EXTRAS = sorted(set(metadata.metadata("rlservo").get_all("Provides-Extra") or ()) - {"dev", "docs", "all"})
 
-# Each command in a process forked from one that has imported the command line, and what is installed of the packages
-# that take long: a tenth of the time of a start.
+# Each command in a process forked from one that has run a command, and imported what is installed of the packages that
+# take long: a twentieth of the time of a start.
 PROGRAM = """
-import contextlib, importlib, json, os, sys, tempfile
-from rlservo.deploy import cli
+import contextlib, importlib, io, json, os, sys, tempfile
+import typer
+from rlservo.deploy import cli, terminal
+cli.app = typer.main.get_command(cli.app)
 for slow in ("onnxruntime", "gymnasium", "torch", "mujoco"):
     with contextlib.suppress(ImportError):
         importlib.import_module(slow)
+sys.argv = ["rlservo", "key", "robot"]
+with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    with contextlib.suppress(SystemExit):
+        cli.main()
+for console in (terminal.output, terminal.errors):
+    console.cache_clear()  # the children's write to their own streams
 ends = []
 for words in json.load(sys.stdin):
     with tempfile.TemporaryFile("w+") as out:
@@ -107,6 +115,7 @@ def test_every_command_says_at_once_which_extra_it_lacks(extra: str, wheel: Path
     extras = [extra] if extra else []
     # With an extra those for which it makes a difference, if only that it is one of what they need.
     concerned = [command for command in NEEDS if not extra or lacking(command, extra) != lacking(command)]
+    assert concerned
     environment = environment_with(wheel, tmp_path / "environment", *extras)
     done = subprocess.run(
         [environment / "bin" / "python", "-I", "-c", PROGRAM],

@@ -1,9 +1,8 @@
 """Runs in robo-gym's environment: drives its own classes on a test's request, and records what they return.
 
-    python robo_gym_driver.py <jobs.json> <results.json>
-
-If a job says "pause", the driver prints a line after that many steps and waits for one on standard input; if it says
-"keep", the next job is another episode in the same environment.
+Each line of standard input names a file of jobs and one for their results, with a tab between; the driver prints "done"
+when it has written that. If a job says "pause", it prints "paused" after that many steps and waits for a line; if one
+says "keep", the next job is another episode in the same environment.
 
 Two of robo-gym 2.0.1's base methods cannot work with any server: `URBaseAvoidanceEnv.reset` calls `super(gym.Env)`,
 which has no reset, and refuses the arguments its subclass passes; its `step` returns five values, but the subclasses
@@ -102,14 +101,16 @@ def run_through_a_crash(job: dict[str, Any], _: dict[str, Any]) -> dict[str, Any
 
 def main() -> None:
     mend_avoidance()
-    jobs = json.loads(Path(sys.argv[1]).read_text())
-    results, kept = [], {}
-    for job in jobs:
-        try:
-            results.append((run_through_a_crash if job.get("crash") else run)(job, kept))
-        except Exception as error:
-            results.append({"error": f"{type(error).__name__}: {error}"})
-    Path(sys.argv[2]).write_text(json.dumps(results))
+    while line := sys.stdin.readline():
+        asked, answered = map(Path, line.rstrip("\n").split("\t"))
+        results, kept = [], {}
+        for job in json.loads(asked.read_text()):
+            try:
+                results.append((run_through_a_crash if job.get("crash") else run)(job, kept))
+            except Exception as error:
+                results.append({"error": f"{type(error).__name__}: {error}"})
+        answered.write_text(json.dumps(results))
+        print("done", flush=True)
 
 
 if __name__ == "__main__":

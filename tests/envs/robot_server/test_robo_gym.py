@@ -6,7 +6,7 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,36 +31,46 @@ ATOL = 2e-4  # of observations: robo-gym computes them from float32 states
 Drive = Callable[..., list[dict[str, Any]]]
 
 
+@pytest.fixture(scope="module")
+def driver(robo_gym_python: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, Path]]:
+    """The driver in robo-gym's environment, whose imports take longer than most tests, and the file of its errors."""
+    errors = tmp_path_factory.mktemp("driver") / "errors.txt"
+    with errors.open("w") as stream:
+        process = subprocess.Popen(
+            [robo_gym_python, DRIVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stream, text=True
+        )
+    try:
+        yield process, errors
+        process.communicate(timeout=60)  # the end of its input is its own
+        assert process.returncode == 0, errors.read_text()
+    finally:
+        process.kill()
+        process.communicate()
+
+
 @pytest.fixture
-def drive(robo_gym_python: Path, tmp_path: Path) -> Drive:
+def drive(driver: tuple[Any, Path], tmp_path: Path) -> Drive:
     """Run jobs in robo-gym's environment and return their results; `at_pause` is called where a job pauses.
 
     Jobs that follow each other with the same arguments are episodes of one simulator, which takes a second to start.
     """
+    process, errors = driver
 
     def run(jobs: list[dict[str, Any]], at_pause: Callable[[], None] | None = None) -> list[dict[str, Any]]:
         asked, answered = tmp_path / "jobs.json", tmp_path / "results.json"
         made_with = [(job["env"], job["arguments"]) for job in jobs]
         keeps = [made == following for made, following in zip(made_with, [*made_with[1:], None], strict=True)]
         asked.write_text(json.dumps([{**job, "keep": keep} for job, keep in zip(jobs, keeps, strict=True)]))
-        line = [str(robo_gym_python), str(DRIVER), str(asked), str(answered)]
-        with subprocess.Popen(
-            line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
-            assert process.stdin is not None
-            assert process.stdout is not None
-            if at_pause is not None:
-                for said in process.stdout:
-                    if said.strip() == "paused":
-                        break
+        print(asked, answered, sep="\t", file=process.stdin, flush=True)
+        while (said := process.stdout.readline()).strip() != "done":
+            assert said, errors.read_text()  # it has ended
+            if said.strip() == "paused":
+                assert at_pause is not None
                 at_pause()
-                process.stdin.write("\n")
-                process.stdin.flush()
-            _, errors = process.communicate(timeout=300)
-        assert process.returncode == 0, errors
+                print(file=process.stdin, flush=True)
         results = json.loads(answered.read_text())
         for job, result in zip(jobs, results, strict=True):
-            assert "error" not in result, f"{job['env']}: {result['error']}\n{errors}"
+            assert "error" not in result, f"{job['env']}: {result['error']}\n{errors.read_text()}"
         return results
 
     return run
