@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rlservo.deploy.ros2.elements import ElementInputs, ElementOutputs, places
+from rlservo.deploy.ros2.elements import COMMANDED, READ, ElementInputs, ElementOutputs, places
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.link import take_command
 from rlservo.envs.ros2.messages import DIAGNOSTICS, POSE_STAMPED, stamp
@@ -124,6 +124,9 @@ def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | 
     if rate_hz is None:
         raise UsageError(f"policy {contract.name!r} states no control rate: give --rate")
     observed, acted = places(contract, node.parameters())
+    for side, numbers in ((observed, READ), (acted, COMMANDED)):
+        for place in side:
+            place.check(numbers)
     inputs = ElementInputs(node.link, observed, max_age_s or max(0.1, 2.0 / rate_hz))
     kinds, name_of = {place.topic: place.kind for place in acted}, node.link.node.resolve_topic_name
     publishers = {topic: take_command(node.link, name_of(topic), kind) for topic, kind in kinds.items()}

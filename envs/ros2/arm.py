@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import threading
@@ -215,7 +216,8 @@ class RosArmConnection:
         made_s = stamp_of(message)
         if positions is None or velocities is None:
             names = ", ".join(message.name)
-            self._problem = f"{self._address['joint_states']} lacks joints of {', '.join(self._joints)}: it has {names}"
+            wanted = f"finite position and velocity of {', '.join(self._joints)}"
+            self._problem = f"{self._address['joint_states']} has no {wanted}: it has {names}"
         elif made_s is None:
             self._problem = f"{self._address['joint_states']} has no stamps: its driver must set them"
         elif self._state is None or made_s > self._state[0]:
@@ -223,7 +225,8 @@ class RosArmConnection:
             self._state = (made_s, age_s, positions, velocities)
 
     def _take_speed(self, message: Any) -> None:
-        self._speed_percent = float(message.data)
+        if math.isfinite(message.data):
+            self._speed_percent = float(message.data)
 
     def _take_mode(self, name: str, message: Any) -> None:
         self._modes[name] = int(message.data if hasattr(message, "data") else message.mode)

@@ -129,11 +129,15 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
 
 def safely(on_message: Callable[[Any], None], topic: str) -> Callable[[Any], None]:
     """Return a callback that survives malformed messages: neither its thread nor the robot's control ends."""
+    said = ""
 
     def take(message: Any) -> None:
+        nonlocal said
         try:
             on_message(message)
         except Exception as error:  # a message from any node
-            log.warning("a message on %s cannot be understood: %s: %s", topic, type(error).__name__, error)
+            if (why := f"{type(error).__name__}: {error}") != said:  # not at the rate of the messages
+                log.warning("a message on %s cannot be understood: %s", topic, why)
+            said = why
 
     return take

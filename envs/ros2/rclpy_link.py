@@ -135,6 +135,12 @@ def message_class(kind: str) -> Any:
         raise RobotError(f"the ROS 2 interface {kind!r} is not installed here: {error}") from error
 
 
+def message_fields(kind: str) -> Mapping[str, str]:
+    """Return the types of a message's fields, by name; `kind` is 'geometry_msgs/Twist', as those types are written."""
+    fields: Mapping[str, str] = message_class(kind.replace("/", "/msg/")).get_fields_and_field_types()
+    return fields
+
+
 def fill(message: Any, values: Mapping[str, Any]) -> Any:
     """Set the fields of a message from a dictionary, and return it."""
     for name, value in values.items():
