@@ -46,6 +46,14 @@ def parse(value: Any) -> Any:
     return value
 
 
+def for_rosbridge(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a message with ROS 1's names of a time's fields; a rosbridge of ROS 2 takes them as well."""
+    names = {"sec": "secs", "nanosec": "nsecs"}
+    return {
+        names.get(name, name): for_rosbridge(one) if isinstance(one, Mapping) else one for name, one in values.items()
+    }
+
+
 def stamp(time_s: float) -> dict[str, int]:
     """Return a time [s] in ROS 2's form."""
     whole = math.floor(time_s)

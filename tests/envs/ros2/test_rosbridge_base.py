@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -321,8 +322,37 @@ def test_bridge_refuses_what_it_does_not_know_and_goes_on(base: RunningBase) -> 
         client.send(json.dumps({"op": "call_service", "service": "/rosapi/nothing", "id": "1"}))
         assert json.loads(client.recv(PATIENCE_S))["result"] is False
         client.send('{"op": "publish", "topic": "/cmd_vel", "msg": {}}')
-        client.send(json.dumps({"op": "subscribe", "topic": "/odom"}))
-        assert "pose" in json.loads(client.recv(PATIENCE_S))["msg"]
+        client.send(json.dumps({"op": "subscribe", "topic": "/odom", "type": "nav_msgs/msg/Odometry"}))
+        assert "has the type nav_msgs/Odometry, not nav_msgs/msg" in json.loads(client.recv(PATIENCE_S))["msg"]
+        client.send(json.dumps({"op": "subscribe", "topic": "/odom", "type": "nav_msgs/Odometry"}))
+        odometry = json.loads(client.recv(PATIENCE_S))["msg"]
+        assert abs(odometry["header"]["stamp"]["secs"] - time.time()) < PATIENCE_S  # ROS 1's, as a MiR's
+
+
+def test_link_that_was_closed_without_its_bridge_does_not_come_back_to_a_new_one() -> None:
+    bridge = RosbridgeServer("127.0.0.1", 0)
+    link = RosbridgeLink("127.0.0.1", bridge.port)
+    link.advertise("/cmd_vel", messages.TWIST)
+    bridge.close()
+    limit = time.monotonic() + PATIENCE_S
+    while link._ros.is_connected:
+        assert time.monotonic() < limit, "it does not notice"
+        time.sleep(0.02)
+    link.close()
+    bridge = RosbridgeServer("127.0.0.1", bridge.port)
+    try:
+        time.sleep(3.0)  # roslibpy connects again after a second
+        assert not bridge._clients  # its topic would be commanded: our next link were refused
+    finally:
+        bridge.close()
+
+
+def test_server_that_never_answers_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rlservo.envs.ros2.rosbridge_link.CONNECT_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(RobotError, match=rf"the server at 127\.0\.0\.1:{port} is not a rosbridge"):
+            RosBase(f"rosbridge://127.0.0.1:{port}")
 
 
 def test_no_bridge_is_one_sentence() -> None:
