@@ -345,8 +345,10 @@ def main(argv: list[str]) -> None:
     """Run the command stream of an arm; see this file's docstring."""
     settings = StreamSettings.from_json(argv[0])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process handles Ctrl-C in the terminal
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     output = os.dup(1)
     os.dup2(2, 1)  # ur_rtde writes to standard output
+    threading.Thread(target=_end_with_standard_input, name="lifeline", daemon=True).start()
     stream = None
     try:
         simulation = URSimulation(settings.ur_model, objects=())  # it takes longer than the watchdog waits
@@ -354,7 +356,6 @@ def main(argv: list[str]) -> None:
         try:
             stream = CommandStream(settings, connection, simulation)
             signal.signal(signal.SIGTERM, lambda *_: stream.is_asked_to_end.set())
-            threading.Thread(target=_end_with_standard_input, args=(stream,), name="lifeline", daemon=True).start()
             stream.run(lambda: _say(output, READY))
         except RobotError as error:  # reported before anything waits for a connection that may be dead
             if stream is not None:
@@ -380,11 +381,11 @@ def _end_soon() -> None:
     os._exit(1)
 
 
-def _end_with_standard_input(stream: CommandStream) -> None:
+def _end_with_standard_input() -> None:
     with contextlib.suppress(OSError):
         while os.read(0, 4096):
             pass
-    stream.is_asked_to_end.set()
+    os.kill(os.getpid(), signal.SIGTERM)  # also while it connects, which may take a minute
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ class Driver:
         header = {"header": {"stamp": messages.stamp(self.now_s())}}
         self.takers[ARM_OPTIONS[name]](messages.parse(header | self.values[name]))
 
-    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
         self.takers[topic] = on_message
         self.send(next(name for name, one in ARM_OPTIONS.items() if one == topic))
 

@@ -266,6 +266,8 @@ class DriftingRobot:
 
     def __init__(self) -> None:
         self.now, self.delay_s = 1000.0, 0.05
+        self.odometries = ["/mir"]
+        self.publish: Publish = lambda _: None
         self._take: Callable[[Any], None] = lambda _: None
 
     def now_s(self) -> float:
@@ -284,12 +286,13 @@ class DriftingRobot:
         self.pass_time(0.0)
 
     def advertise(self, topic: str, kind: str) -> Publish:
-        return lambda _: None
+        return lambda values: self.publish(values)
 
     def publishers(self, topic: str) -> list[Endpoint]:
-        return []
+        return [Endpoint(name, messages.ODOMETRY) for name in self.odometries]
 
-    rivals = publishers
+    def rivals(self, topic: str) -> list[Endpoint]:
+        return []
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         return [Endpoint("/mir", messages.TWIST)]
@@ -298,10 +301,39 @@ class DriftingRobot:
         pass
 
 
-def test_clock_that_drifts_for_hours_is_no_age_but_a_late_message_is(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> DriftingRobot:
     robot = DriftingRobot()
     monkeypatch.setattr("rlservo.envs.ros2.base.open_link", lambda *_: robot)
     monkeypatch.setattr("rlservo.envs.ros2.link.DISCOVERY_S", 0.0)
+    return robot
+
+
+def test_two_odometries_on_one_topic_are_refused(robot: DriftingRobot) -> None:
+    robot.odometries.append("/ekf")
+    with pytest.raises(RobotError, match="/odom comes from /ekf and /mir: end one, or name another"):
+        RosBase("ros2:clock=robot", limits=BaseLimits(stop_distance=0.0), needs_scan=False)
+
+
+def test_command_that_cannot_be_sent_is_a_fault(robot: DriftingRobot) -> None:
+    real = RosBase("rosbridge://mir", limits=BaseLimits(stop_distance=0.0), needs_scan=False)
+    try:
+        assert not real.fault
+
+        def fail(_: object) -> None:
+            raise OSError("no link")
+
+        robot.publish = fail
+        limit = time.monotonic() + PATIENCE_S
+        while not real.fault:
+            assert time.monotonic() < limit
+            time.sleep(0.02)
+        assert real.fault == "command_failed: OSError: no link"
+    finally:
+        real.close()
+
+
+def test_clock_that_drifts_for_hours_is_no_age_but_a_late_message_is(robot: DriftingRobot) -> None:
     real = RosBase("rosbridge://mir", limits=BaseLimits(stop_distance=0.0), needs_scan=False)
     try:
         for _ in range(3 * 3600):
