@@ -43,7 +43,8 @@ class RclpyLink:
             )  # fmt: skip
         except Exception as error:  # rcl's own errors share no public base
             words = " ".join([name, *arguments])
-            raise RobotError(f"ROS 2 does not accept the node's name or arguments, {words}: {error}") from error
+            why = " ".join(str(error).split())  # it may point at the place, on a line of its own
+            raise RobotError(f"ROS 2 does not accept the node's name or arguments, {words}: {why}") from error
         self._own: Counter[tuple[str, str]] = Counter()  # endpoints of ours, by topic
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
