@@ -92,13 +92,11 @@ def test_stale_stamps_a_lost_topic_and_a_missing_joint_are_not_acted_on(ros: Ros
     joints = dict.fromkeys(JOINTS, 0.0)
     assert ros.ask("call", service="/rlservo/start")["success"]
     until_state(ros, "running", lambda: send(ros, joints))
+    newest = "holding: the newest message on /joint_states with"
     for publish, why in (
-        (lambda: send(ros, joints, age_s=5.0), "holding: the newest message on /joint_states is 5."),
-        (lambda: send(ros, joints, age_s=-5.0), "holding: the newest message on /joint_states is 5."),
-        (
-            lambda: send(ros, {"shoulder": 0.0, "elbow": 0.0}),
-            "holding: the newest message on /joint_states with position[wrist]",
-        ),
+        (lambda: send(ros, joints, age_s=5.0), f"{newest} position[shoulder] is 5."),
+        (lambda: send(ros, joints, age_s=-5.0), f"{newest} position[shoulder] is 5."),
+        (lambda: send(ros, {"shoulder": 0.0, "elbow": 0.0}), f"{newest} position[wrist]"),
         (lambda: send(ros, {**joints, "wrist": float("nan")}), "holding: a message on /joint_states has no finite"),
         (lambda: None, "holding: the newest message on"),
     ):
