@@ -365,11 +365,16 @@ def test_link_that_was_closed_without_its_bridge_does_not_come_back_to_a_new_one
     bridge = RosbridgeServer("127.0.0.1", 0)
     link = RosbridgeLink("127.0.0.1", bridge.port)
     link.advertise("/cmd_vel", messages.TWIST)
+
+    def wait_until(condition: Callable[[], bool]) -> None:
+        limit = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < limit
+            time.sleep(0.02)
+
+    wait_until(lambda: any(one.advertised for one in bridge._clients))
     bridge.close()
-    limit = time.monotonic() + PATIENCE_S
-    while link._ros.is_connected:
-        assert time.monotonic() < limit, "it does not notice"
-        time.sleep(0.02)
+    wait_until(lambda: not link._ros.is_connected)
     link.close()
     bridge = RosbridgeServer("127.0.0.1", bridge.port)
     try:
