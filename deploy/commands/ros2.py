@@ -73,8 +73,8 @@ def ros2(
         from rlservo.envs.robots.arm import RobotError
     if record is not None:
         require("record", "mcap", "orjson")
-    stop = threading.Event()
     with ExitStack() as cleanup:
+        cleanup.enter_context(terminal.ends_like_ctrl_c())  # until the robot is connected, which may take a minute
         acting: Any = cleanup.enter_context(acting_policy(url, policy, bundle, transport, deadline_ms, False, None))
         acting = with_fallback(acting, fallback)
         if record is not None:
@@ -85,14 +85,14 @@ def ros2(
         try:
             node = PolicyNode(acting, name, autostart=autostart)
             cleanup.callback(node.close)
-            cleanup.enter_context(terminal.ctrl_c_sets(stop))
+            node.on_connected = lambda: cleanup.enter_context(terminal.ctrl_c_sets(node.stop))
             terminal.note(f"node /{name}: policy {acting.contract.name} {acting.contract.version}; Ctrl-C ends it")
             ours = real_environment(acting.contract)
             if ours is not None and not node.parameters():
                 arguments = ours[1] | parse_env_arguments(env_arg or []) | {"robot": robot, "confirm": False}
-                drive_environment(node, stop, ours[0], arguments, unproven=unproven)
+                drive_environment(node, ours[0], arguments, unproven=unproven)
             else:
-                drive_elements(node, stop, rate_hz=rate, max_age_s=max_age)
+                drive_elements(node, rate_hz=rate, max_age_s=max_age)
         except RobotError as error:
             raise UsageError(str(error)) from error
 

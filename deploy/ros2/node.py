@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rlservo.deploy.ros2.elements import ElementInputs, ElementOutputs, places
+from rlservo.deploy.ros2.elements import COMMANDED, READ, ElementInputs, ElementOutputs, places
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.link import take_command
 from rlservo.envs.ros2.messages import DIAGNOSTICS, POSE_STAMPED, stamp
@@ -57,11 +57,13 @@ class Wanted(str, Enum):
 
 
 class PolicyNode:
-    """A node `rlservo`; `run` drives until `stop` is set. Its services answer at once, the loop follows."""
+    """A node `rlservo`, driven until `stop` is set. Its services answer at once, the loop follows."""
 
     def __init__(self, policy: ActingPolicy, name: str, *, autostart: bool) -> None:
         """Join the graph. Raises RobotError without rclpy."""
         self.policy = policy
+        self.stop = threading.Event()
+        self.on_connected: Callable[[], object] = lambda: None  # before, nothing looks at `stop`
         self.link = RclpyLink(name, is_unique=True)
         self.state, self.why = "waiting", ""
         self.counts: dict[str, int] = {"decisions": 0, "episodes": 0, "successes": 0, "held": 0, "late": 0}
@@ -117,19 +119,23 @@ class PolicyNode:
             self._diagnose({"header": {"stamp": stamp(self.link.now_s())}, "status": [status]})
 
 
-def drive_elements(node: PolicyNode, stop: threading.Event, *, rate_hz: float | None, max_age_s: float | None) -> None:
-    """Drive a robot by the contract's element names until `stop` is set. Raises UsageError, RobotError."""
+def drive_elements(node: PolicyNode, *, rate_hz: float | None, max_age_s: float | None) -> None:
+    """Drive a robot by the contract's element names until the node is stopped. Raises UsageError, RobotError."""
     policy, contract = node.policy, node.policy.contract
     rate_hz = rate_hz or contract.control_rate_hz
     if rate_hz is None:
         raise UsageError(f"policy {contract.name!r} states no control rate: give --rate")
     observed, acted = places(contract, node.parameters())
+    for side, numbers in ((observed, READ), (acted, COMMANDED)):
+        for place in side:
+            place.check(numbers)
     inputs = ElementInputs(node.link, observed, max_age_s or max(0.1, 2.0 / rate_hz))
     kinds, name_of = {place.topic: place.kind for place in acted}, node.link.node.resolve_topic_name
-    publishers = {topic: take_command(node.link, name_of(topic), kind) for topic, kind in kinds.items()}
+    publishers = {topic: take_command(node.link, name_of(topic), kind)[1] for topic, kind in kinds.items()}
     outputs = ElementOutputs(acted, publishers, node.link.now_s)
+    node.on_connected()
     due, was_running = time.monotonic(), False
-    while not stop.is_set():
+    while not node.stop.is_set():
         due = max(due + 1.0 / rate_hz, time.monotonic())
         observation, why = inputs.observe()
         if node.wanted is not Wanted.RUN:
@@ -174,37 +180,38 @@ class _Target:
         self.number += 1
 
 
-def drive_environment(
-    node: PolicyNode, stop: threading.Event, trained_in: str, arguments: Mapping[str, Any], *, unproven: bool
-) -> None:
-    """Drive one of our robots to each target on `~/target` until `stop` is set. Raises UsageError, RobotError."""
+def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str, Any], *, unproven: bool) -> None:
+    """Drive one of our robots to each target on `~/target` until the node is stopped. Raises UsageError, RobotError."""
     real_id, option, frame = REAL[trained_in]
     env = make_env(f"rlservo/{real_id}", arguments, render=False)
     try:
+        node.on_connected()
         check_fit(node.policy.contract, env, arguments)
         if not unproven:
             check_proven(node.policy.contract, env)
         target = _Target(frame)
         node.link.subscribe("~/target", POSE_STAMPED, target.take)
         robot: Any = env.unwrapped
-        robot.simulation.is_called_off = lambda: stop.is_set() or node.wanted is not Wanted.RUN
-        while not stop.is_set():
+        robot.simulation.is_called_off = lambda: node.stop.is_set() or node.wanted is not Wanted.RUN
+        while not node.stop.is_set():
             if node.wanted is not Wanted.RUN:
                 node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
             elif robot.simulation.operator.has_taken_over:
                 node.enter("human")
             elif target.number == target.done:
-                if node.state not in ("arrived", "fault", "refused"):
+                if robot.simulation.stopped_by is not None and node.state != "fault":  # while it stood
+                    node.enter("fault", robot.simulation.stopped_by)
+                elif node.state not in ("arrived", "fault", "refused"):
                     node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
             else:
-                _drive_to(node, stop, env, option, target)
+                _drive_to(node, env, option, target)
                 continue
             robot.simulation.advance()  # the model stays where the robot is
     finally:
         env.close()
 
 
-def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, target: _Target) -> None:
+def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
     """Drive to the newest target, which remains due if the drive is interrupted.
 
     As in a rollout an arm first returns to its start: that is where its policy was trained and proven. After an
@@ -227,7 +234,7 @@ def _drive_to(node: PolicyNode, stop: threading.Event, env: Any, option: str, ta
     target.begun = number
     policy.reset()
     is_first = True
-    while not stop.is_set() and node.wanted is Wanted.RUN and target.number == number:
+    while not node.stop.is_set() and node.wanted is Wanted.RUN and target.number == number:
         try:
             action = policy.act(observation)
         except RlservoError as error:

@@ -31,9 +31,7 @@ from rlservo.envs.ur.simulation import URSimulation
 READY, FAILED = "ready", "failed: "  # lines on standard output; a fault after READY is also FAILED
 FIRST_STATE_S = 5.0
 RUNNING, SAFE_MODES = 7, (1, 2)  # robot_mode, safety_mode: normal and reduced
-STARTUP_MODES = (
-    "no controller", "disconnected", "confirm safety", "booting", "power off", "power on", "idle", "backdrive",
-)  # fmt: skip
+STARTUP_MODES = ("disconnected", "confirm safety", "booting", "power off", "power on", "idle", "backdrive")
 LOST_S = 1.0  # [s] without a package, after which the connection counts as lost
 SLOW_CALL_S = 0.3  # [s] for one command; beyond it, ur_rtde has lost the script or reconnected
 AGE_BOUND_S = 0.1  # [s] oldest state that may be acted on
@@ -154,8 +152,7 @@ class _Connection:
             name = STOP_NAMES.get(safety, f"safety mode {safety}").replace("_", " ")
             raise RobotError(f"the robot at {host} is in {name}: find the cause, then unlock it on the pendant")
         if mode != RUNNING:
-            name = STARTUP_MODES[mode] if 0 <= mode < len(STARTUP_MODES) else f"robot mode {mode}"
-            raise RobotError(f"the robot at {host} is not running ({name}): power it on and release the brakes")
+            raise RobotError(f"the robot at {host} is in {_mode_name(mode)}: power it on and release the brakes")
 
     def close(self) -> None:
         if self.control is not None:
@@ -178,6 +175,10 @@ class Connection(Protocol):
     def close(self) -> None:
         """End the program and disconnect."""
         ...
+
+
+def _mode_name(mode: int) -> str:
+    return STARTUP_MODES[mode] if 0 <= mode < len(STARTUP_MODES) else f"robot mode {mode}"
 
 
 def connect(settings: StreamSettings) -> Connection:
@@ -254,6 +255,8 @@ class CommandStream:
             raise RobotError(
                 f"program_stopped: the controller's watchdog (no command for {silence_s:g} s) or its pendant ended it"
             )
+        if (mode := receive.getRobotMode()) != RUNNING:
+            raise RobotError(f"not_running: the robot is in {_mode_name(mode)}: power it on and release the brakes")
 
     def _command(self, now: float) -> None:
         """Send the next setpoint. A missed period is not caught up, which would make the arm hurry."""
@@ -345,8 +348,10 @@ def main(argv: list[str]) -> None:
     """Run the command stream of an arm; see this file's docstring."""
     settings = StreamSettings.from_json(argv[0])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the starting process handles Ctrl-C in the terminal
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     output = os.dup(1)
     os.dup2(2, 1)  # ur_rtde writes to standard output
+    threading.Thread(target=_end_with_standard_input, name="lifeline", daemon=True).start()
     stream = None
     try:
         simulation = URSimulation(settings.ur_model, objects=())  # it takes longer than the watchdog waits
@@ -354,7 +359,6 @@ def main(argv: list[str]) -> None:
         try:
             stream = CommandStream(settings, connection, simulation)
             signal.signal(signal.SIGTERM, lambda *_: stream.is_asked_to_end.set())
-            threading.Thread(target=_end_with_standard_input, args=(stream,), name="lifeline", daemon=True).start()
             stream.run(lambda: _say(output, READY))
         except RobotError as error:  # reported before anything waits for a connection that may be dead
             if stream is not None:
@@ -380,11 +384,11 @@ def _end_soon() -> None:
     os._exit(1)
 
 
-def _end_with_standard_input(stream: CommandStream) -> None:
+def _end_with_standard_input() -> None:
     with contextlib.suppress(OSError):
         while os.read(0, 4096):
             pass
-    stream.is_asked_to_end.set()
+    os.kill(os.getpid(), signal.SIGTERM)  # also while it connects, which may take a minute
 
 
 if __name__ == "__main__":

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from rlservo.envs.robots.arm import ROS2, ROSBRIDGE, RobotError
 
 ROSBRIDGE_PORT = 9090
+TOPIC = r"(?:~?/)?[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*"
 CHOICES = {
     "command": ("position", "velocity", "trajectory"),
     "status": ("on", "off"),
@@ -76,5 +78,7 @@ class RosAddress:
                 raise RobotError(f"robot {robot!r}: {setting!r} is not one of {', '.join(options)} with =VALUE")
             if name in CHOICES and value not in CHOICES[name]:
                 raise RobotError(f"robot {robot!r}: {name} is {value!r}, expected {' or '.join(CHOICES[name])}")
+            if name not in CHOICES and name != "prefix" and not re.fullmatch(TOPIC, value):
+                raise RobotError(f"robot {robot!r}: {name} is {value!r}, expected a topic's name")
             options[name] = value
         return cls(host, port, options)

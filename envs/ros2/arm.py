@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +40,7 @@ RUNNING = 7
 FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
 AHEAD_S = 0.1  # of a trajectory's point: the controller begins each new one at the arm's lagging position
 DRIFT_GAIN = 2.0  # [1/s], of velocity commands
+LAST_S = 0.2  # [s] for the last velocity, zero, to leave
 KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTORY}
 
 Vector = NDArray[np.float64]
@@ -72,7 +76,7 @@ class RosArmConnection:
                 self._guard = subprocess.Popen(
                     words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
                 )
-            self._publish = take_command(self._link, topic, KINDS[self._how])
+            _, self._publish = take_command(self._link, topic, KINDS[self._how])
             if self._guard is not None and self._guard.stdout is not None and not self._guard.stdout.readline():
                 raise RobotError(f"the guard of {topic} ended at its start: nothing is commanded without it")
         except BaseException:
@@ -80,10 +84,15 @@ class RosArmConnection:
             raise
 
     def close(self) -> None:
-        """Leave the graph; the guard of velocity commands ends with its input, after a final zero."""
-        self._link.close()
+        """Leave the graph; the guard of velocity commands ends with its input, after a final zero of its own."""
         if self._guard is not None and self._guard.stdin is not None:
-            self._guard.stdin.close()
+            if self._setpoint is not None:
+                self._publish({"data": [0.0] * 6})
+                time.sleep(LAST_S)
+            with contextlib.suppress(OSError):
+                self._guard.stdin.close()
+        self._link.close()
+        if self._guard is not None:
             self._guard.wait()
 
     def age_s(self) -> float | None:
@@ -150,17 +159,20 @@ class RosArmConnection:
         if self._how == "position":
             self._publish({"data": goal.tolist()})
         elif self._how == "velocity":
-            self._publish({"data": (velocity + DRIFT_GAIN * (goal - measured) * bool(velocity.any())).tolist()})
             self.kickWatchdog()
+            self._publish({"data": (velocity + DRIFT_GAIN * (goal - measured) * bool(velocity.any())).tolist()})
         else:
             self._publish(self._trajectory(goal, velocity))
         return True
 
     def kickWatchdog(self) -> None:
-        """Feed the guard of velocity commands."""
+        """Feed the guard of velocity commands. Raises RobotError if it has ended."""
         if self._guard is not None and self._guard.stdin is not None:
-            self._guard.stdin.write(b".")
-            self._guard.stdin.flush()
+            try:
+                self._guard.stdin.write(b".")
+                self._guard.stdin.flush()
+            except OSError as error:
+                raise RobotError("guard_ended: nothing is commanded without the guard of velocity commands") from error
 
     def servoStop(self) -> None:
         """Stop sending: the arm holds, and another node may command it."""
@@ -195,7 +207,7 @@ class RosArmConnection:
                 )
                 # ur_dashboard_msgs' own type, or a plain number if that package is not installed.
                 kind = own or link.publishers(topic)[0].type or INT8
-                link.subscribe(topic, kind, lambda message, name=name: self._take_mode(name, message), is_kept=True)  # type: ignore[misc]
+                link.subscribe(topic, kind, lambda message, name=name: self._take_mode(name, message))  # type: ignore[misc]
         wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
         check_clock(address["joint_states"], self.age_s() or 0.0)
 
@@ -215,7 +227,8 @@ class RosArmConnection:
         made_s = stamp_of(message)
         if positions is None or velocities is None:
             names = ", ".join(message.name)
-            self._problem = f"{self._address['joint_states']} lacks joints of {', '.join(self._joints)}: it has {names}"
+            wanted = f"finite position and velocity of {', '.join(self._joints)}"
+            self._problem = f"{self._address['joint_states']} has no {wanted}: it has {names}"
         elif made_s is None:
             self._problem = f"{self._address['joint_states']} has no stamps: its driver must set them"
         elif self._state is None or made_s > self._state[0]:
@@ -223,7 +236,8 @@ class RosArmConnection:
             self._state = (made_s, age_s, positions, velocities)
 
     def _take_speed(self, message: Any) -> None:
-        self._speed_percent = float(message.data)
+        if math.isfinite(message.data):
+            self._speed_percent = float(message.data)
 
     def _take_mode(self, name: str, message: Any) -> None:
         self._modes[name] = int(message.data if hasattr(message, "data") else message.mode)

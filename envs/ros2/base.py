@@ -32,7 +32,7 @@ from rlservo.envs.robots.command_stream import Order, Phase
 from rlservo.envs.robots.limits import CheckedLimits
 from rlservo.envs.robots.link_delay import LinkDelay
 from rlservo.envs.ros2.address import BASE_OPTIONS, RosAddress
-from rlservo.envs.ros2.link import FIRST_MESSAGES_S, Endpoint, check_clock, open_link, take_command, wait_until
+from rlservo.envs.ros2.link import FIRST_MESSAGES_S, check_clock, open_link, take_command, wait_until
 from rlservo.envs.ros2.messages import (
     FLAG,
     LASER_SCAN,
@@ -51,6 +51,7 @@ RATE_HZ = 20.0
 AGE_BOUND_S = 0.3  # [s] oldest input that may be acted on: scans come at 12.5 Hz, or 10
 LOST_S = 2.0  # [s] without odometry, after which the connection counts as lost
 DEADMAN_S = 0.5  # [s], oldest dead-man message
+TWISTS = {"auto": (TWIST, TWIST_STAMPED), "Twist": (TWIST,), "TwistStamped": (TWIST_STAMPED,)}
 SCALES = (1.0, 0.75, 0.5, 0.25)  # of a velocity, tried in order if something is in the way
 INSTANTS = 5  # points checked on the path to a standstill
 
@@ -141,8 +142,11 @@ class RosBase:
             wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
             for topic, one in self._inputs.items():
                 check_clock(topic, one.age_s)
-            self._is_stamped = self._find_twist() == TWIST_STAMPED
-            self._publish = take_command(link, address["cmd_vel"], TWIST_STAMPED if self._is_stamped else TWIST)
+                names = {one.node for one in link.publishers(topic)} if not address.host else set()
+                if len(names) > 1:  # behind a rosbridge any number may be registered
+                    raise RobotError(f"{topic} comes from {' and '.join(sorted(names))}: end one, or name another")
+            kind, self._publish = take_command(link, address["cmd_vel"], *TWISTS[address["twist"]])
+            self._is_stamped = kind == TWIST_STAMPED
         except BaseException:
             link.close()
             raise
@@ -223,25 +227,6 @@ class RosBase:
         missing = [topic for topic, one in self._inputs.items() if one.value is None]
         return f"no message with a stamp on {', '.join(missing)}: is the base's driver running"
 
-    def _find_twist(self) -> str:
-        """Return the message type of the command topic: as set, or as its subscribers use it."""
-        said = self.address["twist"]
-        if said != "auto":
-            return TWIST_STAMPED if said == "TwistStamped" else TWIST
-        topic = self.address["cmd_vel"]
-        found: list[Endpoint] = []
-
-        def look() -> bool:
-            found[:] = self._link.subscribers(topic)
-            return bool(found)
-
-        wait_until(look, f"nothing subscribes to {topic}: is the base's driver running", FIRST_MESSAGES_S)
-        kinds = {one.type for one in found} & {TWIST, TWIST_STAMPED}
-        if len(kinds) != 1:
-            types = ", ".join(sorted({one.type for one in found}))
-            raise RobotError(f"{topic} has subscribers of the types {types}: set twist=Twist or twist=TwistStamped")
-        return kinds.pop()
-
     def _points(self) -> Vector:
         scans = list(self._inputs.values())[1:]
         return np.concatenate([one.value for one in scans]) if scans else np.zeros((0, 2))
@@ -252,10 +237,13 @@ class RosBase:
         due = time.monotonic()
         while not (self._is_closed.is_set() and self._velocity == (0.0, 0.0)):
             due = max(due + 1.0 / RATE_HZ, time.monotonic())
-            self._velocity = self._next()
-            if self.phase != Phase.FREE:
-                made_s = self._link.now_s() if self._is_stamped else None
-                self._publish(twist(*self._velocity, stamped_s=made_s))
+            try:
+                self._velocity = self._next()
+                if self.phase != Phase.FREE:
+                    made_s = self._link.now_s() if self._is_stamped else None
+                    self._publish(twist(*self._velocity, stamped_s=made_s))
+            except Exception as error:  # of the link: without commands the base stops by its timeout
+                self.fault, self._velocity = f"command_failed: {type(error).__name__}: {error}", (0.0, 0.0)
             time.sleep(max(0.0, due - time.monotonic()))
 
     def _next(self) -> Twist2:

@@ -96,8 +96,12 @@ def check_clock(topic: str, age_s: float) -> None:
         raise RobotError(f"{topic} has stamps {age_s:.1f} s old: synchronise the clocks (chrony), or set clock=robot")
 
 
-def take_command(link: Link, topic: str, kind: str) -> Publish:
-    """Advertise a command topic exclusively. Raises RobotError, which names a node that publishes on it already."""
+def take_command(link: Link, topic: str, *kinds: str) -> tuple[str, Publish]:
+    """Advertise a command topic exclusively, with the one of `kinds` that its subscribers use; return that too.
+
+    Raises RobotError, which names a node that publishes on it already.
+    """
+    types: set[str] = set()
 
     def refuse() -> None:
         if not link.rivals(topic):
@@ -109,31 +113,41 @@ def take_command(link: Link, topic: str, kind: str) -> Publish:
 
     def is_listened_to() -> bool:
         refuse()
-        return any(one.type == kind for one in link.subscribers(topic))
+        types.update(one.type for one in link.subscribers(topic))
+        return not types.isdisjoint(kinds)
 
     try:
-        wait_until(is_listened_to, f"nothing subscribes to {topic} ({kind}): is its controller running", 20.0)
+        wait_until(
+            is_listened_to, f"nothing subscribes to {topic} ({' or '.join(kinds)}): is its controller running", 20.0
+        )
     except RobotError:
-        types = {one.type for one in link.subscribers(topic)} - {kind}
         if types:
-            raise RobotError(f"{topic} takes {', '.join(sorted(types))}, not {kind}: name another topic") from None
+            what = f"{topic} takes {', '.join(sorted(types))}, not {' or '.join(kinds)}"
+            raise RobotError(f"{what}: name another topic or type") from None
         raise
+    kind, *others = types.intersection(kinds)
+    if others:
+        raise RobotError(f"{topic} has subscribers of the types {', '.join(sorted(types))}: set twist=TYPE")
     publish = link.advertise(topic, kind)
     # If two start at once, each sees the other, and neither commands.
     until = time.monotonic() + DISCOVERY_S
     while time.monotonic() < until:
         refuse()
         time.sleep(LOOK_S)
-    return publish
+    return kind, publish
 
 
 def safely(on_message: Callable[[Any], None], topic: str) -> Callable[[Any], None]:
     """Return a callback that survives malformed messages: neither its thread nor the robot's control ends."""
+    said = ""
 
     def take(message: Any) -> None:
+        nonlocal said
         try:
             on_message(message)
         except Exception as error:  # a message from any node
-            log.warning("a message on %s cannot be understood: %s: %s", topic, type(error).__name__, error)
+            if (why := f"{type(error).__name__}: {error}") != said:  # not at the rate of the messages
+                log.warning("a message on %s cannot be understood: %s", topic, why)
+            said = why
 
     return take

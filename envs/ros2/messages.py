@@ -46,6 +46,14 @@ def parse(value: Any) -> Any:
     return value
 
 
+def for_rosbridge(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a message with ROS 1's names of a time's fields; a rosbridge of ROS 2 takes them as well."""
+    names = {"sec": "secs", "nanosec": "nsecs"}
+    return {
+        names.get(name, name): for_rosbridge(one) if isinstance(one, Mapping) else one for name, one in values.items()
+    }
+
+
 def stamp(time_s: float) -> dict[str, int]:
     """Return a time [s] in ROS 2's form."""
     whole = math.floor(time_s)
@@ -63,21 +71,28 @@ def stamp_of(message: Any) -> float | None:
     return float(seconds + made.nanosec * 1e-9) or None
 
 
+def joint_index(message: Any, name: str) -> int:
+    """Return where a joint is in a JointState. Raises ValueError if it is not there exactly once."""
+    present = list(message.name)
+    if present.count(name) != 1:
+        raise ValueError(name)
+    return present.index(name)
+
+
 def in_order(message: Any, names: Sequence[str], field: str) -> Vector | None:
-    """Return a JointState's values for the joints `names`, in any order; None if one is missing."""
-    values, present = getattr(message, field), list(message.name)
+    """Return a JointState's values for the joints `names`, in any order; None if one is missing or there twice."""
+    values = getattr(message, field)
     try:
-        indices = [present.index(name) for name in names]
-        ordered = np.array([values[index] for index in indices], dtype=np.float64)
+        ordered = np.array([values[joint_index(message, name)] for name in names], dtype=np.float64)
     except (ValueError, IndexError):
         return None
     return ordered if np.isfinite(ordered).all() else None
 
 
 def yaw_of(orientation: Any) -> float:
-    """Return a quaternion's turn about z [rad]."""
+    """Return a quaternion's turn about z [rad], of any length; NaN if it is zero, as in an empty message of ROS 1."""
     x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return math.atan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z) if any((x, y, z, w)) else math.nan
 
 
 def quaternion(yaw: float) -> dict[str, float]:
@@ -129,10 +144,18 @@ def scan_message(ranges: Vector, angle_min: float, increment: float, frame: str,
 
 
 def scan_points(scan: Any, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Vector:
-    """Return the end points (n, 2) [m] of a LaserScan's beams that hit something; `pose` is the scanner's."""
+    """Return the end points (n, 2) [m] of a LaserScan's beams that hit something; `pose` is the scanner's.
+
+    By REP 117 inf is a free beam, and -inf a hit too near to measure. Raises ValueError if no beam shows either: a
+    blind scanner sees no way free.
+    """
     ranges = np.array([math.inf if one is None else one for one in scan.ranges], dtype=np.float64)
+    ranges[np.isneginf(ranges)] = scan.range_min
     angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges)) + pose[2]
-    meets = np.isfinite(ranges) & (ranges >= scan.range_min) & (ranges < scan.range_max)
+    is_known = (ranges >= scan.range_min) & np.isfinite(angles)
+    if not is_known.any() or math.isnan(scan.range_max):
+        raise ValueError(f"no beam of {len(ranges)} has a reading and an angle")
+    meets = is_known & np.isfinite(ranges) & (ranges < scan.range_max)
     ranges, angles = ranges[meets], angles[meets]
     return np.stack([pose[0] + ranges * np.cos(angles), pose[1] + ranges * np.sin(angles)], axis=1)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rlservo.envs.robots.arm import RobotError
-from rlservo.envs.ros2.link import Endpoint, Publish, safely
+from rlservo.envs.ros2.link import FIRST_MESSAGES_S, Endpoint, Publish, safely, wait_until
 
 GUARD = "rlservo_guard"  # publishes only zeros, when its own commander has fallen silent
 ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, also for the processes that we start
@@ -34,15 +34,17 @@ class RclpyLink:
             ) from error
         self._context = rclpy.Context()
         arguments = [one for one in os.environ.get(ARGUMENTS_VARIABLE, "").split("\n") if one]
-        words = ["--ros-args", *(arguments if is_unique else _without_names(arguments))] if arguments else None
+        given = ["--ros-args", *(arguments if is_unique else _without_names(arguments))] if arguments else None
         try:
-            rclpy.init(args=words, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+            rclpy.init(args=given, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+            self.node: Any = rclpy.create_node(
+                name if is_unique else f"{name}_{os.getpid()}", context=self._context,
+                automatically_declare_parameters_from_overrides=is_unique,
+            )  # fmt: skip
         except Exception as error:  # rcl's own errors share no public base
-            raise RobotError(f"ROS 2 does not accept the arguments {' '.join(arguments)}: {error}") from error
-        self.node: Any = rclpy.create_node(
-            name if is_unique else f"{name}_{os.getpid()}", context=self._context,
-            automatically_declare_parameters_from_overrides=is_unique,
-        )  # fmt: skip
+            words = " ".join([name, *arguments])
+            why = " ".join(str(error).split())  # it may point at the place, on a line of its own
+            raise RobotError(f"ROS 2 does not accept the node's name or arguments, {words}: {why}") from error
         self._own: Counter[tuple[str, str]] = Counter()  # endpoints of ours, by topic
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -53,21 +55,25 @@ class RclpyLink:
 
         self._thread = threading.Thread(target=spin, name="ros", daemon=True)
         self._thread.start()
+        wait_until(lambda: self.now_s() > 0.0, "no message on /clock, which use_sim_time asks for", FIRST_MESSAGES_S)
 
     def now_s(self) -> float:
         """Return ROS's time [s]: the system's, or /clock's with use_sim_time."""
         return float(self.node.get_clock().now().nanoseconds * 1e-9)
 
-    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
-        """Subscribe to the newest message, best effort as for sensors; `is_kept`: reliably, to an earlier one too."""
-        qos = self._qos(is_kept, False)
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
+        """Subscribe to the newest message, best effort as for sensors; also to an earlier one if publishers keep it."""
+        from rclpy.qos import QoSDurabilityPolicy  # pyright: ignore[reportMissingImports]
+
+        offered = {one.qos_profile.durability for one in self.node.get_publishers_info_by_topic(topic)}
+        qos = self._qos(is_kept=offered == {QoSDurabilityPolicy.TRANSIENT_LOCAL}, is_reliable=False)
         made = self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), qos)
         self._own["subscriber", made.topic_name] += 1
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
         """Publish reliably, only the newest message."""
         made = message_class(kind)
-        publisher = self.node.create_publisher(made, topic, self._qos(is_kept, True))
+        publisher = self.node.create_publisher(made, topic, self._qos(is_kept=is_kept, is_reliable=True))
         self._own["publisher", publisher.topic_name] += 1
 
         def publish(values: Mapping[str, Any]) -> None:
@@ -116,7 +122,7 @@ class RclpyLink:
         return others
 
     @staticmethod
-    def _qos(is_kept: bool, is_reliable: bool) -> Any:
+    def _qos(*, is_kept: bool, is_reliable: bool) -> Any:
         from rclpy import qos  # pyright: ignore[reportMissingImports]
 
         reliable, best = qos.QoSReliabilityPolicy.RELIABLE, qos.QoSReliabilityPolicy.BEST_EFFORT
@@ -133,6 +139,12 @@ def message_class(kind: str) -> Any:
         return getattr(importlib.import_module(f"{package}.{folder or 'msg'}"), name)
     except (ImportError, AttributeError, ValueError) as error:
         raise RobotError(f"the ROS 2 interface {kind!r} is not installed here: {error}") from error
+
+
+def message_fields(kind: str) -> Mapping[str, str]:
+    """Return the types of a message's fields, by name; `kind` is 'geometry_msgs/Twist', as those types are written."""
+    fields: Mapping[str, str] = message_class(kind.replace("/", "/msg/")).get_fields_and_field_types()
+    return fields
 
 
 def fill(message: Any, values: Mapping[str, Any]) -> Any:

@@ -1,7 +1,11 @@
-"""Link through a rosbridge (WebSocket), with roslibpy: it needs no ROS here. A MiR has one on port 9090."""
+"""Link through a rosbridge (WebSocket), with roslibpy: it needs no ROS here. A MiR has one on port 9090.
+
+A MiR's is ROS 1, which refuses ROS 2's names of types and times; a rosbridge of ROS 2 takes ROS 1's.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -9,7 +13,7 @@ from typing import Any
 
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.link import Endpoint, Publish, safely
-from rlservo.envs.ros2.messages import parse
+from rlservo.envs.ros2.messages import for_rosbridge, parse
 
 CONNECT_S = 10.0
 CALL_S = 5.0
@@ -38,7 +42,7 @@ class RosbridgeLink:
         try:
             self._ros.run(timeout=CONNECT_S)
         except Exception as error:
-            self._ros.close()
+            self.close()
             raise RobotError(f"the server at {host}:{port} is not a rosbridge: {error}") from error
 
     def now_s(self) -> float:
@@ -47,19 +51,19 @@ class RosbridgeLink:
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
         """Subscribe to the newest message."""
-        one = self._library.Topic(self._ros, topic, kind, queue_length=1)
+        one = self._library.Topic(self._ros, topic, kind.replace("/msg/", "/"), queue_length=1)
         one.subscribe(safely(lambda message: on_message(parse(message)), topic))
         self._topics.append(one)
 
     def advertise(self, topic: str, kind: str) -> Publish:
         """Publish only the newest message."""
-        one = self._library.Topic(self._ros, topic, kind, queue_size=1)
+        one = self._library.Topic(self._ros, topic, kind.replace("/msg/", "/"), queue_size=1)
         one.advertise()
         self._topics.append(one)
 
         def publish(values: Mapping[str, Any]) -> None:
             if self._ros.is_connected:
-                one.publish(self._library.Message(values))
+                one.publish(self._library.Message(for_rosbridge(values)))
 
         return publish
 
@@ -82,11 +86,13 @@ class RosbridgeLink:
         """Unsubscribe and close the connection."""
         for one in self._topics:
             one.unadvertise() if one.is_advertised else one.unsubscribe()
-        self._ros.close()
+        self._ros.call_later(0.0, self._ros.factory.stopTrying)  # else it would connect again, and advertise
+        with contextlib.suppress(Exception):  # a bridge that has stopped answering; its error is not public
+            self._ros.close(timeout=1.0)
 
     def _nodes(self, which: str, topic: str) -> list[Endpoint]:
-        nodes = self._call(which, topic).get(which, [])
-        kind = self._call("topic_type", topic).get("type", "") if nodes else ""
+        nodes = self._call(which, topic).get(which) or []
+        kind = (self._call("topic_type", topic).get("type") or "") if nodes else ""
         if "/msg/" not in kind:  # ROS 1's spelling
             kind = kind.replace("/", "/msg/")
         return [Endpoint(node, kind) for node in nodes]

@@ -1,4 +1,4 @@
-"""Rosbridge in front of a simulated robot: rosbridge's JSON over WebSocket, without ROS.
+"""Rosbridge in front of a simulated robot: rosbridge's JSON over WebSocket, without ROS, as ROS 1 and a MiR have it.
 
 Only topics (advertise, publish, subscribe), and rosapi's services about them. A client that is too slow gets the newest
 message of each topic.
@@ -19,7 +19,7 @@ from websockets.sync.server import ServerConnection, serve
 
 from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.ros2.link import Publish
-from rlservo.envs.ros2.messages import parse
+from rlservo.envs.ros2.messages import for_rosbridge, parse
 
 LARGEST_MESSAGE = 1024 * 1024
 BRIDGE, ROBOT = "/rosbridge_websocket", "/robot"
@@ -93,18 +93,18 @@ class RosbridgeServer:
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None]) -> None:
         """Call `on_message` with the messages that clients publish."""
-        self._types[topic], self._takers[topic] = kind, on_message
+        self._types[topic], self._takers[topic] = kind.replace("/msg/", "/"), on_message
 
     def advertise(self, topic: str, kind: str) -> Publish:
         """Return a function that sends to the subscribed clients."""
-        self._types[topic] = kind
+        self._types[topic] = kind.replace("/msg/", "/")
         self._published.add(topic)
 
         def publish(values: Mapping[str, Any]) -> None:
             with self._lock:
                 takers = [client for client in self._clients if topic in client.subscribed]
             if takers:
-                text = json.dumps({"op": "publish", "topic": topic, "msg": values})
+                text = json.dumps({"op": "publish", "topic": topic, "msg": for_rosbridge(values)})
                 for client in takers:
                     client.send(topic, text)
 
@@ -139,6 +139,9 @@ class RosbridgeServer:
         try:
             request = json.loads(text)
             op, topic = request["op"], str(request.get("topic", ""))
+            kind = self._types.get(topic)
+            if op in ("subscribe", "advertise") and kind is not None and request.get("type", kind) != kind:
+                raise ValueError(f"{topic} has the type {kind}, not {request['type']}")
             if op == "subscribe":
                 client.subscribed.add(topic)
             elif op == "unsubscribe":

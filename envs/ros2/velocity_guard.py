@@ -5,18 +5,17 @@ ros2_control's forward velocity controller has no timeout: the arm of a killed p
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
 import sys
 import time
 
-from rlservo.envs.ros2.link import wait_until
 from rlservo.envs.ros2.messages import NUMBERS
 from rlservo.envs.ros2.rclpy_link import GUARD, RclpyLink
 
 READY = b"ready\n"  # on standard output: the guard is active
-FIND_S = 20.0
 SILENCE_S = 0.1
 SETTLE_S = 0.5  # for the last zeros to reach the controller
 
@@ -26,9 +25,11 @@ def main(topic: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     link = RclpyLink(GUARD)
     publish, is_fed = link.advertise(topic, NUMBERS), False  # advertised now, as a subscriber takes a while to find it
-    wait_until(lambda: bool(link.subscribers(topic)), f"nothing subscribes to {topic}", FIND_S)
+    while not (link.subscribers(topic) or select.select([0], [], [], SILENCE_S)[0]):
+        pass
     time.sleep(SETTLE_S)
-    os.write(1, READY)
+    with contextlib.suppress(BrokenPipeError):  # standard input has ended too
+        os.write(1, READY)
     while True:
         ready, _, _ = select.select([0], [], [], SILENCE_S)
         if ready and not os.read(0, 4096):

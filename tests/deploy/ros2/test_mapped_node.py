@@ -92,10 +92,11 @@ def test_stale_stamps_a_lost_topic_and_a_missing_joint_are_not_acted_on(ros: Ros
     joints = dict.fromkeys(JOINTS, 0.0)
     assert ros.ask("call", service="/rlservo/start")["success"]
     until_state(ros, "running", lambda: send(ros, joints))
+    newest = "holding: the newest message on /joint_states with"
     for publish, why in (
-        (lambda: send(ros, joints, age_s=5.0), "holding: the newest message on /joint_states is 5."),
-        (lambda: send(ros, joints, age_s=-5.0), "holding: the newest message on /joint_states is 5."),
-        (lambda: send(ros, {"shoulder": 0.0, "elbow": 0.0}), "holding: a message on /joint_states has no finite"),
+        (lambda: send(ros, joints, age_s=5.0), f"{newest} position[shoulder] is 5."),
+        (lambda: send(ros, joints, age_s=-5.0), f"{newest} position[shoulder] is 5."),
+        (lambda: send(ros, {"shoulder": 0.0, "elbow": 0.0}), f"{newest} position[wrist]"),
         (lambda: send(ros, {**joints, "wrist": float("nan")}), "holding: a message on /joint_states has no finite"),
         (lambda: None, "holding: the newest message on"),
     ):
@@ -172,6 +173,44 @@ def test_mapping_of_no_element_is_one_sentence(ros: Ros, bundle: Path) -> None:
     )
     wrong.wait_for("parameter 'observation.speed' maps no element: expected one of observation.element_0")
     assert wrong.end(0) == 2
+
+
+CHECK = """
+import sys
+from rlservo.deploy.ros2.elements import COMMANDED, READ, Place
+from rlservo.envs.robots.arm import RobotError
+from rlservo.export.contract.errors import UsageError
+for side, text in (line.split(": ") for line in sys.stdin.read().splitlines()):
+    try:
+        Place.parse("x", text).check(COMMANDED if side == "action" else READ)
+        print("good")
+    except (UsageError, RobotError) as error:
+        print(error)
+"""
+
+
+def test_mapping_to_a_field_that_does_not_exist_or_is_no_number_is_one_sentence(ros: Ros) -> None:
+    wrong = {
+        "observation: /imu sensor_msgs/msg/Imu angular_velocity.q": "angular_velocity.q is no field: expected one of",
+        "observation: /imu sensor_msgs/msg/Imu angular_velocity": "angular_velocity is geometry_msgs/Vector3: expected",
+        "observation: /js sensor_msgs/msg/JointState position": "position is sequence<double>: expected one of",
+        "observation: /odom nav_msgs/msg/Odometry twist.twist.linear.x[0]": "x is double: expected an array of",
+        "action: /go std_msgs/msg/Int32 data": "data is int32: expected one of double, float",
+        "action: /cmd_vel geometry_msgs/msg/Twist linear.x.y": "linear.x.y is no field: expected one of",
+        "action: /cmd my_msgs/msg/Wheels left": "the ROS 2 interface 'my_msgs/msg/Wheels' is not installed here",
+    }
+    good = [
+        "observation: /go std_msgs/msg/Int32 data", "observation: /imu sensor_msgs/msg/Imu orientation_covariance[0]",
+        "observation: /js sensor_msgs/msg/JointState effort[a]", "observation: /s sensor_msgs/msg/LaserScan ranges[9]",
+        "action: /cmd_vel geometry_msgs/msg/TwistStamped twist.linear.x", "action: /a std_msgs/msg/Float32 data",
+    ]  # fmt: skip
+    checked = subprocess.run(
+        [str(PYTHON), "-c", CHECK], input="\n".join([*wrong, *good]), capture_output=True, text=True, timeout=120
+    )
+    assert checked.returncode == 0, checked.stderr
+    lines = checked.stdout.splitlines()
+    assert all(said in line for said, line in zip(wrong.values(), lines, strict=False)), lines
+    assert lines[len(wrong) :] == ["good"] * len(good)
 
 
 def test_ros_2_finds_the_package_its_executable_and_launch_file(ros: Ros, wheel: Path, tmp_path: Path) -> None:

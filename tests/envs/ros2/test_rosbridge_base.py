@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 import threading
@@ -265,6 +266,8 @@ class DriftingRobot:
 
     def __init__(self) -> None:
         self.now, self.delay_s = 1000.0, 0.05
+        self.odometries = ["/mir"]
+        self.publish: Publish = lambda _: None
         self._take: Callable[[Any], None] = lambda _: None
 
     def now_s(self) -> float:
@@ -283,12 +286,13 @@ class DriftingRobot:
         self.pass_time(0.0)
 
     def advertise(self, topic: str, kind: str) -> Publish:
-        return lambda _: None
+        return lambda values: self.publish(values)
 
     def publishers(self, topic: str) -> list[Endpoint]:
-        return []
+        return [Endpoint(name, messages.ODOMETRY) for name in self.odometries]
 
-    rivals = publishers
+    def rivals(self, topic: str) -> list[Endpoint]:
+        return []
 
     def subscribers(self, topic: str) -> list[Endpoint]:
         return [Endpoint("/mir", messages.TWIST)]
@@ -297,10 +301,39 @@ class DriftingRobot:
         pass
 
 
-def test_clock_that_drifts_for_hours_is_no_age_but_a_late_message_is(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def robot(monkeypatch: pytest.MonkeyPatch) -> DriftingRobot:
     robot = DriftingRobot()
     monkeypatch.setattr("rlservo.envs.ros2.base.open_link", lambda *_: robot)
     monkeypatch.setattr("rlservo.envs.ros2.link.DISCOVERY_S", 0.0)
+    return robot
+
+
+def test_two_odometries_on_one_topic_are_refused(robot: DriftingRobot) -> None:
+    robot.odometries.append("/ekf")
+    with pytest.raises(RobotError, match="/odom comes from /ekf and /mir: end one, or name another"):
+        RosBase("ros2:clock=robot", limits=BaseLimits(stop_distance=0.0), needs_scan=False)
+
+
+def test_command_that_cannot_be_sent_is_a_fault(robot: DriftingRobot) -> None:
+    real = RosBase("rosbridge://mir", limits=BaseLimits(stop_distance=0.0), needs_scan=False)
+    try:
+        assert not real.fault
+
+        def fail(_: object) -> None:
+            raise OSError("no link")
+
+        robot.publish = fail
+        limit = time.monotonic() + PATIENCE_S
+        while not real.fault:
+            assert time.monotonic() < limit
+            time.sleep(0.02)
+        assert real.fault == "command_failed: OSError: no link"
+    finally:
+        real.close()
+
+
+def test_clock_that_drifts_for_hours_is_no_age_but_a_late_message_is(robot: DriftingRobot) -> None:
     real = RosBase("rosbridge://mir", limits=BaseLimits(stop_distance=0.0), needs_scan=False)
     try:
         for _ in range(3 * 3600):
@@ -321,8 +354,42 @@ def test_bridge_refuses_what_it_does_not_know_and_goes_on(base: RunningBase) -> 
         client.send(json.dumps({"op": "call_service", "service": "/rosapi/nothing", "id": "1"}))
         assert json.loads(client.recv(PATIENCE_S))["result"] is False
         client.send('{"op": "publish", "topic": "/cmd_vel", "msg": {}}')
-        client.send(json.dumps({"op": "subscribe", "topic": "/odom"}))
-        assert "pose" in json.loads(client.recv(PATIENCE_S))["msg"]
+        client.send(json.dumps({"op": "subscribe", "topic": "/odom", "type": "nav_msgs/msg/Odometry"}))
+        assert "has the type nav_msgs/Odometry, not nav_msgs/msg" in json.loads(client.recv(PATIENCE_S))["msg"]
+        client.send(json.dumps({"op": "subscribe", "topic": "/odom", "type": "nav_msgs/Odometry"}))
+        odometry = json.loads(client.recv(PATIENCE_S))["msg"]
+        assert abs(odometry["header"]["stamp"]["secs"] - time.time()) < PATIENCE_S  # ROS 1's, as a MiR's
+
+
+def test_link_that_was_closed_without_its_bridge_does_not_come_back_to_a_new_one() -> None:
+    bridge = RosbridgeServer("127.0.0.1", 0)
+    link = RosbridgeLink("127.0.0.1", bridge.port)
+    link.advertise("/cmd_vel", messages.TWIST)
+
+    def wait_until(condition: Callable[[], bool]) -> None:
+        limit = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < limit
+            time.sleep(0.02)
+
+    wait_until(lambda: any(one.advertised for one in bridge._clients))
+    bridge.close()
+    wait_until(lambda: not link._ros.is_connected)
+    link.close()
+    bridge = RosbridgeServer("127.0.0.1", bridge.port)
+    try:
+        time.sleep(3.0)  # roslibpy connects again after a second
+        assert not bridge._clients  # its topic would be commanded: our next link were refused
+    finally:
+        bridge.close()
+
+
+def test_server_that_never_answers_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rlservo.envs.ros2.rosbridge_link.CONNECT_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with pytest.raises(RobotError, match=rf"the server at 127\.0\.0\.1:{port} is not a rosbridge"):
+            RosBase(f"rosbridge://127.0.0.1:{port}")
 
 
 def test_no_bridge_is_one_sentence() -> None:
