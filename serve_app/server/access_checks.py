@@ -125,21 +125,13 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     return key
 
 
-class StreamKey:
-    """The key of an open stream, checked and counted with every request: it may have been removed since."""
+def authorize_again(keys: CurrentKeys, presented: bytes | None) -> bool:
+    """Return whether the key of an open stream may ask for exploring actions; it may have been removed since.
 
-    def __init__(self, keys: CurrentKeys, presented: bytes | None) -> None:
-        """Nothing is checked before the first request."""
-        self._keys = keys
-        self._presented = presented
-
-    def check(self) -> bool:
-        """Return whether the key may ask for exploring actions.
-
-        Raises as `authorize` does; RateLimitError concerns only this request.
-        """
-        key = authorize(self._keys, self._presented, Access.act)
-        return key is None or key.may_explore
+    Raises as `authorize` does; RateLimitError concerns only this request.
+    """
+    key = authorize(keys, presented, Access.act)
+    return key is None or key.may_explore
 
 
 def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:

@@ -30,12 +30,11 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import NO_EPISODE, ClientGoneError, Request, check_deadline
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.current_keys import CurrentKeys
-from rlservo.serve_app.server.logs import FIELDS, RequestLog
+from rlservo.serve_app.server.logs import FIELDS, write_answer, write_failure
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.settings import MEMORY, ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
@@ -107,7 +106,6 @@ class RequestHandler:
             max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, store=sessions, is_alone=is_alone
         )
         self.metrics = Metrics(replica)
-        self.log = RequestLog(settings)
         self.shadows = Shadows(self.metrics.record_differences)
         self.recorder: RequestRecorder | None = None
         if settings.record is not None:
@@ -139,15 +137,15 @@ class RequestHandler:
         return store
 
     async def answer(
-        self, codec: Codec[Source, Reply], request: Request, source: Source, key: StreamKey | None = None
+        self, codec: Codec[Source, Reply], request: Request, source: Source, recheck: Callable[[], bool] | None = None
     ) -> Reply:
-        """Return the reply; the codec reads from `source`. A stream's `key` is checked for each of its requests.
+        """Return the reply; the codec reads from `source`. `recheck` is a stream's `authorize_again`.
 
         Raises RlservoError, which has been counted and logged, and ClientGoneError.
         """
         try:
-            if key is not None:
-                request.may_explore = key.check()
+            if recheck is not None:
+                request.may_explore = recheck()
             content = await codec.receive(request, source)
             self._admit(request)
             self.store()  # being not ready takes precedence over any fault of the request
@@ -177,8 +175,8 @@ class RequestHandler:
             self._count_end(request, decision, request.episode.final_status)
         if self.recorder is not None:
             self.recorder.note_answer(request, decision, taken)
-        if self.log.every:
-            self.log.write_answer(request, decision, taken)
+        if self.settings.log_requests:
+            write_answer(request, decision, taken)
         return reply
 
     async def decide(self, request: Request) -> Decision:
@@ -215,7 +213,7 @@ class RequestHandler:
         else:  # an alias counts as its version, no version as the default
             version = store.default(name) if version is None else store.plans[name].version_of(version) or ""
         self.metrics.count_failure(request.protocol, name, version, counted_as)
-        self.log.write_failure(request, code, error.message)
+        write_failure(request, code, error.message if self.settings.log_values else None)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
         """Count a request that failed with the current exception, and log its traceback."""
