@@ -37,7 +37,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
                         "version": version,
                         **vars(state),
                         "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
-                        "requests": handler.metrics.requests(name, version),
+                        "requests": sum(each.count for each in handler.metrics.answers_of(name, version)),
                     }
                     for version, state in states.get(name, {}).items()
                 ],

@@ -60,18 +60,6 @@ def shared_by_workers() -> Iterator[None]:
             del os.environ[FOLDER_VARIABLE]
 
 
-@dataclass(frozen=True)
-class Totals:
-    """Answers of one version of a policy since the start, over all protocols."""
-
-    requests: int
-    failures: int
-    observations: int
-    request_s: float
-    inference_s: float
-    last_answer_ms: int  # since 1970; 0 if there was none
-
-
 @dataclass(slots=True)
 class Answers:
     """Answered requests to one version of a policy over one protocol."""
@@ -151,22 +139,9 @@ class Metrics(Collector):
         for difference in differences:
             histogram.observe(difference)
 
-    def requests(self, policy: str, version: str) -> int:
-        """Return the number of requests to a version that this process has answered, over all protocols."""
-        return sum(answers.count for key, answers in self.answers.items() if key[:2] == (policy, version))
-
-    def totals(self, policy: str, version: str) -> Totals:
-        """Return the sums over a version's requests; failures that did not ask for an action do not count."""
-        found = [answers for key, answers in self.answers.items() if key[:2] == (policy, version)]
-        failed = (count for key, count in self.failures.items() if key[:2] == (policy, version) and key[3] != IDLE)
-        return Totals(
-            requests=sum(answers.count for answers in found),
-            failures=sum(failed),
-            observations=sum(answers.observations for answers in found),
-            request_s=sum(_sum_of(answers.latency) for answers in found),
-            inference_s=sum(_sum_of(answers.inference) for answers in found),
-            last_answer_ms=round(1e3 * max((answers.last_s for answers in found), default=0.0)),
-        )
+    def answers_of(self, policy: str, version: str) -> list[Answers]:
+        """Return the answers of a version since the start, one for each protocol."""
+        return [answers for key, answers in self.answers.items() if key[:2] == (policy, version)]
 
     def counter(self, name: str, documentation: str, total: float, **labels: str) -> None:
         """Raise a counter to a total; a smaller total than before has restarted from zero."""
@@ -214,7 +189,8 @@ class Metrics(Collector):
             yield family
 
 
-def _sum_of(histogram: Histogram) -> float:
+def sum_of(histogram: Histogram) -> float:
+    """Return the sum of a histogram's values."""
     (family,) = histogram.collect()
     return next(sample.value for sample in family.samples if sample.name.endswith("_sum"))
 
