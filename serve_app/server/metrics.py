@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import logging
 import math
 import os
 import tempfile
@@ -36,8 +35,6 @@ from rlservo.serve_app.versions.policy_store import Decision
 
 if TYPE_CHECKING:
     from rlservo.serve_app.server.request_handler import RequestHandler
-
-logger = logging.getLogger(__name__)
 
 FOLDER_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"  # read by prometheus_client when it is imported
 EVERY_S = 1.0
@@ -212,21 +209,11 @@ def _of_all_workers(folder: Path) -> Iterable[Metric]:
 
 async def exposition(handler: RequestHandler) -> bytes:
     """Return all metrics as Prometheus reads them."""
-    sample(handler)
+    await sample(handler)
     return await asyncio.to_thread(handler.metrics.text)  # thousands of series take a while
 
 
-async def keep_sampled(handler: RequestHandler) -> None:
-    """Sample until cancelled, for the other workers to read."""
-    while True:
-        try:
-            sample(handler)
-        except Exception:  # a fault in one metric must not stop the others
-            logger.exception("the metrics could not be sampled")
-        await asyncio.sleep(EVERY_S)
-
-
-def sample(handler: RequestHandler) -> None:
+async def sample(handler: RequestHandler) -> None:
     """Bring all counters and gauges up to date."""
     for part in (requests, versions, process, sessions):
         part(handler)
