@@ -21,7 +21,6 @@ import contextlib
 import logging
 import time
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 from rlservo.export.contract.contract import Contract
@@ -41,7 +40,7 @@ from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.protocols.error_statuses import describe, error_answer, send_reply
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields
 from rlservo.serve_app.protocols.routes import WEBSOCKET, Call, Route
-from rlservo.serve_app.server.access_checks import LABEL, authorize_again, header_text, presented_key
+from rlservo.serve_app.server.access_checks import LABEL, StreamKey, header_text, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_length
 from rlservo.serve_app.server.metrics import IDLE
@@ -141,7 +140,7 @@ class _Stream:
     ) -> None:
         """`keeps`: whether the connection continues after an error."""
         self._handler, self._codec, self._opening, self._send, self._keeps = handler, codec, opening, send, keeps
-        self._recheck = partial(authorize_again, handler.keys, presented_key(opening.headers))
+        self._key = StreamKey(handler.keys, presented_key(opening.headers))
         self._timings: dict[str, float] | None = None
         self._is_fresh = False
         self._last = time.perf_counter()
@@ -180,7 +179,7 @@ class _Stream:
         self._last = request.received
         self._is_fresh = False
         try:
-            reply = await handler.answer(self._codec, request, message, self._recheck)
+            reply = await handler.answer(self._codec, request, message, self._key)
         except RlservoError as error:
             if not self._keeps or isinstance(error, UnauthenticatedError):
                 raise

@@ -15,6 +15,7 @@ import ipaddress
 import re
 import socket
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
@@ -125,13 +126,20 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     return key
 
 
-def authorize_again(keys: CurrentKeys, presented: bytes | None) -> bool:
-    """Return whether the key of an open stream may ask for exploring actions; it may have been removed since.
+@dataclass(frozen=True)
+class StreamKey:
+    """The key of an open stream, checked and counted with every request: it may have been removed since."""
 
-    Raises as `authorize` does; RateLimitError concerns only this request.
-    """
-    key = authorize(keys, presented, Access.act)
-    return key is None or key.may_explore
+    keys: CurrentKeys
+    presented: bytes | None
+
+    def check(self) -> bool:
+        """Return whether the key may ask for exploring actions.
+
+        Raises as `authorize` does; RateLimitError concerns only this request.
+        """
+        key = authorize(self.keys, self.presented, Access.act)
+        return key is None or key.may_explore
 
 
 def fold_headers(headers: Iterable[tuple[bytes, bytes]]) -> dict[bytes, bytes]:

@@ -56,16 +56,14 @@ class CurrentKeys:
     def __init__(self, settings: ServerSettings) -> None:
         """Read the keys that the settings name, as `Keys.from_settings` does. Raises UsageError."""
         self._settings = settings
-        file = settings.api_keys_file
-        content = None if file is None else read_key_file(Path(file))
-        self.accepted = Keys.from_settings(settings, file_content=content)
+        self.accepted = Keys.from_settings(settings)
         """The keys that are accepted now: another object after every change."""
         self.current = True
         """Whether these are the file's current keys; False if the file cannot be used or read."""
         self.limits = RateLimits()
         self._calls = BlockingCalls(READ_S)
-        self._seen: bytes | str | None = content  # or the reason why it could not be read
-        self._used: bytes | str | None = content
+        self._seen: bytes | str | None = None  # the file's content, or the reason why it could not be read
+        self._used: bytes | str | None = None
 
     async def refresh(self) -> None:
         """Read the file; use its content once two reads in a row have seen the same."""

@@ -30,6 +30,7 @@ from rlservo.export.contract.errors import (
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import NO_EPISODE, ClientGoneError, Request, check_deadline
 from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.content_bounds import count_rows
@@ -137,15 +138,15 @@ class RequestHandler:
         return store
 
     async def answer(
-        self, codec: Codec[Source, Reply], request: Request, source: Source, recheck: Callable[[], bool] | None = None
+        self, codec: Codec[Source, Reply], request: Request, source: Source, key: StreamKey | None = None
     ) -> Reply:
-        """Return the reply; the codec reads from `source`. `recheck` is a stream's `authorize_again`.
+        """Return the reply; the codec reads from `source`. A stream's `key` is checked for each of its requests.
 
         Raises RlservoError, which has been counted and logged, and ClientGoneError.
         """
         try:
-            if recheck is not None:
-                request.may_explore = recheck()
+            if key is not None:
+                request.may_explore = key.check()
             content = await codec.receive(request, source)
             self._admit(request)
             self.store()  # being not ready takes precedence over any fault of the request

@@ -38,7 +38,7 @@ from rlservo.serve_app.protocols.open_inference import model_info
 from rlservo.serve_app.protocols.open_inference.infer import ReplyOptions, fill, reply_of
 from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.protocols.open_inference.tensors import DTYPES, datatype_of
-from rlservo.serve_app.server.access_checks import LABEL, authorize, authorize_again, header_text, presented_key
+from rlservo.serve_app.server.access_checks import LABEL, StreamKey, authorize, header_text, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
 from rlservo.serve_app.server.request_handler import RequestHandler
@@ -114,7 +114,7 @@ class Grpc:
         except Exception as error:
             _fail(context, error)
             return
-        recheck = functools.partial(authorize_again, handler.keys, presented_key(opening.headers))
+        key = StreamKey(handler.keys, presented_key(opening.headers))
         try:
             while True:
                 try:
@@ -126,7 +126,7 @@ class Grpc:
                     return
                 request = replace(opening, received=time.perf_counter(), arrived=time.perf_counter())
                 try:
-                    reply = await handler.answer(self._codec, request, (content, None), recheck)
+                    reply = await handler.answer(self._codec, request, (content, None), key)
                     yield messages.ModelStreamInferResponse(infer_response=reply)
                 except UnauthenticatedError as error:  # the key is no longer accepted
                     _fail(context, error)
