@@ -124,15 +124,9 @@ class PolicyServer(InferenceMethods):
         try:
             configure(self._settings, replica=replica)
             check_exposure(host, self._settings)
-            self._control = control = plan_follower(places, self._settings)
+            self._control = plan_follower(places, self._settings)
             self._app = create_app(
-                lambda: control.store,
-                self._settings,
-                replica=replica,
-                control=control,
-                host=host,
-                is_alone=False,
-                is_behind_serve=True,
+                self._control, self._settings, replica=replica, host=host, is_alone=False, is_behind_serve=True
             )
         except RlservoError as error:
             raise _plain(error) from None
@@ -158,7 +152,7 @@ class PolicyServer(InferenceMethods):
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
             return
         try:
-            await self._running.enter_async_context(running(self._app.handler, self._control, user_config))
+            await self._running.enter_async_context(running(self._app.handler, user_config))
         except RlservoError as error:
             raise _plain(error) from None
 

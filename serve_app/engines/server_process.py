@@ -13,22 +13,21 @@ from typing import Any
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.server import current_keys, metrics
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 logger = logging.getLogger(__name__)
 
 
 @contextlib.asynccontextmanager
-async def running(handler: RequestHandler, control: PlanFollower, served: Any) -> AsyncIterator[None]:
+async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
     """Load and prove the plan's versions or, without a plan, those of `served` (ServedConfig), and follow changes.
 
     Raises UsageError, BundleError and UnavailableError.
     """
+    control, settings = handler.control, handler.settings
     await control.configure(served)
     handler.admission.start_clock()
-    settings, plan_poll_s = handler.settings, control.files.poll_s
     background = [
-        repeat(plan_poll_s, control.follow, "the plan cannot be followed"),
+        repeat(control.files.poll_s, control.follow, "the plan cannot be followed"),
         control.warn_of_newer(),  # beside the other: the plan is followed even if the look hangs
     ]
     if settings.poll_s is not None:

@@ -191,16 +191,9 @@ class EmbeddedServer:
             configure(settings, replica=replica)
             _stop_with_parent()
         control = plan_follower(self.places, settings)
-        app = create_app(
-            lambda: control.store,
-            settings,
-            replica=replica,
-            control=control,
-            host=self.host,
-            is_alone=not is_worker,
-        )
+        app = create_app(control, settings, replica=replica, host=self.host, is_alone=not is_worker)
         stack.push_async_callback(app.handler.close)
-        await stack.enter_async_context(running(app.handler, control, self.served))
+        await stack.enter_async_context(running(app.handler, self.served))
         store = app.handler.store()
         if settings.default_policy not in (None, *store.names):
             raise UsageError(

@@ -240,10 +240,13 @@ def requests(handler: RequestHandler) -> None:
 def versions(handler: RequestHandler) -> None:
     """Sample the plan that this process follows, and each version's default flag, batches and drift."""
     show = handler.metrics
-    if handler.control is not None and handler.control.plan is not None:
-        show.gauge("rlservo_plan_generation", "Plan that this process follows", handler.control.plan.generation)
-    for name, version, policy in handler.policies():
-        which, is_default = {"policy": name, "version": version}, version == handler.store().default(name)
+    plan, store = handler.control.plan, handler.control.store
+    if plan is None or store is None:
+        return
+    show.gauge("rlservo_plan_generation", "Plan that this process follows", plan.generation)
+    for policy in store.policies:
+        name, version = policy.contract.name, policy.contract.version
+        which, is_default = {"policy": name, "version": version}, version == store.default(name)
         show.gauge("rlservo_policy_loaded", "1 for the default version, 0 for the others", is_default, **which)
         drift = policy.drift
         if drift is None:

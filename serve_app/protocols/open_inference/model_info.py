@@ -30,7 +30,6 @@ from rlservo.serve_app.protocols.request_fields import parse_fields, parse_json,
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route, of_policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
-from rlservo.serve_app.server.listing import states_of
 from rlservo.serve_app.server.metrics import IDLE, Metrics, sum_of
 from rlservo.serve_app.server.request_handler import RequestHandler
 
@@ -103,7 +102,7 @@ def repository_index(handler: RequestHandler, *, ready: bool | None = False, **_
     handler.store()
     return [
         {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
-        for name, versions in states_of(handler).items()
+        for name, versions in handler.control.states().items()
         for version, state in versions.items()
         if state.state == "ready" or not ready
     ]

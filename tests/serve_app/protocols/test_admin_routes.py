@@ -73,9 +73,7 @@ def port(folder: Path, key_path: Path, served: Serve, tmp_path: Path) -> Iterato
     config = {"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}},
                            "gridworld": {"versions": ["1"]}}, "unlisted": "ignore"}  # fmt: skip
     asyncio.run(control.configure(config))
-    with served(
-        create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
-    ) as port:
+    with served(create_app(control, ServerSettings(operator_key=digest), replica="only")) as port:
         yield port
 
 
@@ -161,7 +159,7 @@ def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> It
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
     control = PlanFollower(VersionLoader(Repository([root])), plan_files(root))
     asyncio.run(control.configure({}))
-    app = create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
+    app = create_app(control, ServerSettings(operator_key=digest), replica="only")
     with served(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
         yield client, port, root
 
@@ -221,7 +219,7 @@ def test_administration_needs_the_key_and_acting_does_not(port: int) -> None:
 def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, served: Serve, tmp_path: Path) -> None:
     control = PlanFollower(VersionLoader(Repository([folder / "ur5" / "1"])), plan_files(tmp_path))
     asyncio.run(control.configure({}))
-    with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:
+    with served(create_app(control, ServerSettings())) as open_port:
         with (
             AdminClient(f"http://127.0.0.1:{open_port}", api_key="any") as client,
             pytest.raises(ForbiddenError, match="this server has none"),

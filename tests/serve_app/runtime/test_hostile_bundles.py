@@ -82,7 +82,7 @@ def url(root: Path, served: Serve, patience: dict[str, float]) -> Iterator[str]:
     loader = VersionLoader(Repository([root]), **patience)
     control = PlanFollower(loader, plan_files(root))
     asyncio.run(control.configure({}))
-    app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
+    app = create_app(control, ServerSettings(operator_key=DIGEST), replica="r")
     with served(app) as port:
         yield f"http://127.0.0.1:{port}"
 
