@@ -34,7 +34,7 @@ async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
         background.append(repeat(settings.poll_s, control.load_newer, "looking for new versions failed"))
     if settings.api_keys_file is not None:
         background.append(repeat(current_keys.PERIOD_S, handler.keys.refresh, "the API keys cannot be reread"))
-    if handler.metrics.is_shared:  # for the other workers to read
+    if handler.metrics.folder is not None:  # for the other workers to read
         sample = partial(metrics.sample, handler)
         background.append(repeat(metrics.EVERY_S, sample, "the metrics cannot be sampled"))
     tasks = [asyncio.create_task(each) for each in background]

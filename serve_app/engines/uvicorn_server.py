@@ -114,10 +114,10 @@ def serve_policies(
         if grpc_port is not None:
             listen(host, grpc_port, option="--grpc-port").close()
         key, line = new_key("operator", admin=True)
-        if admin_key_file is not None and not stack.enter_context(written_key(admin_key_file, key)):
-            admin_key_file = None
-        if admin_key_file is not None:
+        if admin_key_file is not None and stack.enter_context(written_key(admin_key_file, key)):
             chosen = chosen.model_copy(update={"operator_key": line.split()[-1]})
+        else:
+            admin_key_file = None
         server = EmbeddedServer(
             tuple(place_of(place) for place in places), host, grpc_port, workers, chosen, dict(served or {})
         )

@@ -74,7 +74,7 @@ class Metrics(Collector):
 
     def __init__(self, replica: str = "") -> None:
         self._replica = replica
-        self._folder = os.environ.get(FOLDER_VARIABLE)
+        self.folder = os.environ.get(FOLDER_VARIABLE)  # that several workers share
         self._registry = registry = CollectorRegistry()
         self._counted = CollectorRegistry()  # what is sampled
         self._sampled: dict[str, Any] = {}  # counters and gauges by name
@@ -99,11 +99,6 @@ class Metrics(Collector):
         self.answers: dict[tuple[str, str, str], Answers] = {}  # by policy, version, protocol
         self.failures: Counter[tuple[str, str, str, str]] = Counter()  # by the same and the error's code
         self.ends: Counter[tuple[str, str, bool]] = Counter()  # by policy, version and success
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether several workers share their metrics."""
-        return self._folder is not None
 
     def record_answer(self, protocol: str, decision: Decision, seconds: float) -> None:
         """Count a request that got its action `seconds` after it arrived."""
@@ -171,15 +166,13 @@ class Metrics(Collector):
 
     def text(self) -> bytes:
         """Return all metrics as Prometheus reads them: of this process, or of all workers."""
-        registry = CollectorRegistry()
-        registry.register(self)
-        return generate_latest(registry)
+        return generate_latest(self)
 
     def collect(self) -> Iterator[Metric]:
         """Yield the current metric families."""
         # Counters come first here and in the files: no answer is counted before it is timed.
         own = itertools.chain(self._counted.collect(), self._registry.collect())
-        for family in own if self._folder is None else _of_all_workers(Path(self._folder)):
+        for family in own if self.folder is None else _of_all_workers(Path(self.folder)):
             family.samples = [
                 each for each in family.samples if not math.isnan(each.value) and not each.name.endswith("_created")
             ]
