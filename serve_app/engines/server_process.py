@@ -26,6 +26,9 @@ async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
     control, settings = handler.control, handler.settings
     await control.configure(served)
     handler.admission.start_clock()
+    sample = partial(metrics.sample, handler) if handler.metrics.folder is not None else None
+    if sample is not None:  # for the other workers to read
+        await sample()
     background = [
         repeat(control.files.poll_s, control.follow, "the plan cannot be followed"),
         control.warn_of_newer(),  # beside the other: the plan is followed even if the look hangs
@@ -34,8 +37,7 @@ async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
         background.append(repeat(settings.poll_s, control.load_newer, "looking for new versions failed"))
     if settings.api_keys_file is not None:
         background.append(repeat(current_keys.PERIOD_S, handler.keys.refresh, "the API keys cannot be reread"))
-    if handler.metrics.folder is not None:  # for the other workers to read
-        sample = partial(metrics.sample, handler)
+    if sample is not None:
         background.append(repeat(metrics.EVERY_S, sample, "the metrics cannot be sampled"))
     tasks = [asyncio.create_task(each) for each in background]
     # Objects loaded by now stay alive: a garbage collection that walks them would delay requests.

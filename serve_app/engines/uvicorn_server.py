@@ -134,13 +134,13 @@ def serve_policies(
             _run_workers(server, listener, ready, stopping)
             return
         server.on_ready = ready
-        running = _Server(server.config(), stopping, stop)
+        process = _Server(server.config(), stopping, stop)
         configure(chosen)
         UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
         if in_main:
-            stack.enter_context(_stop_signals(lambda: setattr(running, "should_exit", True)))
+            stack.enter_context(_stop_signals(lambda: setattr(process, "should_exit", True)))
         try:
-            running.run(sockets=[listener])
+            process.run(sockets=[listener])
         except SystemExit:
             raise server.failure or UnavailableError("the server could not start: see its log") from None
 
