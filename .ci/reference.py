@@ -190,7 +190,7 @@ def pairs(node: ast.Assign) -> Iterator[tuple[str, Any]]:
 
 def http_api() -> str:
     control: Any = object()  # nothing is asked of it
-    app = create_app(lambda: None, ServerSettings(), control=control)
+    app = create_app(control, ServerSettings())
     text = ["# HTTP API", NOTE]
     text.append(
         paragraph(

@@ -70,7 +70,7 @@ def on_post_build(config: Any) -> None:
     for name in ("swagger-ui.css", "swagger-ui-bundle.js"):
         shutil.copy(files_of_swagger_ui() / name, site / "swagger" / name)
     control: Any = object()  # nothing is asked of it
-    text = openapi(create_app(lambda: None, ServerSettings(), control=control).table).decode().replace("</", "<\\/")
+    text = openapi(create_app(control, ServerSettings()).table).decode().replace("</", "<\\/")
     # Swagger UI resolves an OpenAPI 3.1 document's references by the page's address, which a page from disk lacks.
     text = text.replace('"openapi":"3.1.0"', '"openapi":"3.0.3"', 1)
     (site / "openapi.html").write_text(OPENAPI_PAGE % text, encoding="utf-8")

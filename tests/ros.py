@@ -21,7 +21,7 @@ import pytest
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import HEEDING_CTRL_C
-from stores import load_store
+from stores import control_of, load_store
 
 ROOT = Path(__file__).resolve().parents[1]
 PYTHON = ROOT / ".ros" / "bin" / "python"
@@ -116,7 +116,7 @@ class SlowServer:
 
     def __init__(self, folder: Path) -> None:
         store = load_store(folder)
-        self._app, self.delay_s = create_app(lambda: store, ServerSettings()), 0.0
+        self._app, self.delay_s = create_app(control_of(store), ServerSettings()), 0.0
 
     async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] == "http":

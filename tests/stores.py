@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,9 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.plan_files import PlanFiles
+from rlservo.serve_app.versions.plan_follower import VersionState
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig
 
 
 def load_store(*folders: Path, options: Mapping[str, PolicyOptions] | None = None) -> PolicyStore:
@@ -32,6 +33,31 @@ def store_of(*policies: Policy, **given: Any) -> PolicyStore:
         before = plans[name].versions if name in plans else {}
         plans[name] = PolicyPlan(versions={**before, version: policy.digest}, aliases={PRODUCTION: version})
     return PolicyStore(policies, plans, **given)
+
+
+def control_of(store: PolicyStore | Callable[[], PolicyStore | None] | None) -> Any:
+    """What a server serves, in a `PlanFollower`'s place: a store, or what a function returns at each request."""
+    return _Given(store if callable(store) else lambda: store)
+
+
+class _Given:
+    behind = ()
+
+    def __init__(self, provide: Callable[[], PolicyStore | None]) -> None:
+        self._provide = provide
+
+    @property
+    def store(self) -> PolicyStore | None:
+        return self._provide()
+
+    @property
+    def plan(self) -> Plan:
+        return Plan(generation=0, policies={} if self.store is None else dict(self.store.plans))
+
+    def states(self) -> dict[str, dict[str, VersionState]]:
+        assert self.store is not None
+        ready = VersionState("ready")
+        return {name: dict.fromkeys(self.store.versions(name), ready) for name in self.store.names}
 
 
 def plan_files(folder: Path, **given: Any) -> PlanFiles:

@@ -8,6 +8,7 @@ microseconds, a hop to another actor milliseconds. A replica imports neither tor
 # No `from __future__ import annotations` here: Serve reads the type of build's argument to parse `args`.
 
 import asyncio
+import contextlib
 import logging
 import os
 from collections.abc import AsyncIterator
@@ -21,14 +22,15 @@ from ray.serve import Application, Deployment
 
 from rlservo.export.contract.errors import RlservoError
 from rlservo.serve_app.engines.autoscaling import BUSY, Load
-from rlservo.serve_app.engines.server_process import Serving
-from rlservo.serve_app.protocols.asgi_app import PolicyApp
+from rlservo.serve_app.engines.server_process import running
+from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
 from rlservo.serve_app.protocols.open_inference.messages import SERVICE, STREAM, UNARY
 from rlservo.serve_app.repository.storage import place_of
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.server.start_check import plan_follower
 from rlservo.serve_app.wire.addresses import is_loopback
 
 logger = logging.getLogger(__name__)
@@ -122,12 +124,15 @@ class PolicyServer(InferenceMethods):
         try:
             configure(self._settings, replica=replica)
             check_exposure(host, self._settings)
-            self._serving = Serving(
-                places, self._settings, replica=replica, host=host, is_alone=False, is_behind_serve=True
+            self._control = plan_follower(places, self._settings)
+            self._app = create_app(
+                self._control, self._settings, replica=replica, host=host, is_alone=False, is_behind_serve=True
             )
         except RlservoError as error:
             raise _plain(error) from None
-        self._grpc = Grpc(self._serving.handler, local_only=is_loopback(host))
+        self._running = contextlib.AsyncExitStack()
+        self._running.push_async_callback(self._app.handler.close)
+        self._grpc = Grpc(self._app.handler, local_only=is_loopback(host))
         if os.environ.get(SWITCHES[0]) != "1":
             logger.warning(
                 "requests reach this replica through Serve's Python proxy, ten times slower than HAProxy: set %s=1 and "
@@ -136,18 +141,18 @@ class PolicyServer(InferenceMethods):
             )
 
     def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica
-        return self._serving.app
+        return self._app
 
     async def reconfigure(self, user_config: Any) -> None:
         """Apply the configuration: Serve calls this at the start, and on `serve deploy` with a new one.
 
         Serve sends a replica no requests while this runs, so only the first call waits until everything is loaded.
         """
-        if self._serving.control.store is not None:
+        if self._control.store is not None:
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
             return
         try:
-            await self._serving.start(user_config)
+            await self._running.enter_async_context(running(self._app.handler, user_config))
         except RlservoError as error:
             raise _plain(error) from None
 
@@ -158,17 +163,17 @@ class PolicyServer(InferenceMethods):
     async def check_health(self) -> None:
         """Report that the event loop runs and the policies are loaded; otherwise Serve replaces this replica."""
         await asyncio.sleep(0)
-        if self._serving.control.store is None:
+        if self._control.store is None:
             raise RuntimeError("no policies are loaded: the deployment's user_config must be a map, not null")
 
     async def __del__(self) -> None:
         """End the recording. Serve calls this after the replica has answered its last request."""
-        if (serving := getattr(self, "_serving", None)) is not None:
-            await serving.stop()
+        if (stack := getattr(self, "_running", None)) is not None:
+            await stack.aclose()
 
     async def _configure(self, user_config: Any) -> None:
         try:
-            await self._serving.control.configure(user_config)
+            await self._control.configure(user_config)
         except Exception:
             logger.exception("the configuration cannot be read; still serving the previous one")
 

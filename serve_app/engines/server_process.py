@@ -1,69 +1,66 @@
-"""Policies, application and background tasks of one server process, the same under every engine."""
+"""Start, background steps and end of one server process, the same under every engine."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
-from collections.abc import Sequence
+import logging
+from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from typing import Any
 
-from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.metrics import keep_sampled
-from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import loader_and_plans
-from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.export.contract.errors import RlservoError
+from rlservo.serve_app.server import current_keys, metrics
+from rlservo.serve_app.server.request_handler import RequestHandler
+
+logger = logging.getLogger(__name__)
 
 
-class Serving:
-    """Application, policies and gRPC of one process; an engine starts and stops them in its event loop."""
+@contextlib.asynccontextmanager
+async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
+    """Load and prove the plan's versions or, without a plan, those of `served` (ServedConfig), and follow changes.
 
-    def __init__(
-        self,
-        places: Sequence[str],
-        settings: ServerSettings,
-        *,
-        replica: str,
-        host: str,
-        is_alone: bool,
-        is_behind_serve: bool = False,
-    ) -> None:
-        """Take the folders and URIs of policies, this process's name and the address that it listens on.
-
-        `is_alone` says whether every request reaches this process. Nothing is loaded yet. Raises UsageError.
-        """
-        self.settings = settings
-        self.control = PlanFollower(*loader_and_plans(places, settings))
-        self.app = create_app(
-            lambda: self.control.store,
-            settings,
-            replica=replica,
-            control=self.control,
-            host=host,
-            is_alone=is_alone,
-            is_behind_serve=is_behind_serve,
-        )
-        self.handler = self.app.handler
-        self._tasks: list[asyncio.Task[None]] = []
-
-    async def start(self, served: Any) -> None:
-        """Load and prove the plan's versions or, without a plan, those of `served` (ServedConfig).
-
-        Raises UsageError, BundleError and UnavailableError.
-        """
-        await self.control.configure(served)
-        self.handler.admission.start_clock()
-        self._tasks.append(asyncio.create_task(self.control.poll_plan()))
-        if self.handler.metrics.is_shared:
-            self._tasks.append(asyncio.create_task(keep_sampled(self.handler)))
-        if self.settings.poll_s is not None:
-            self._tasks.append(asyncio.create_task(self.control.poll_repository(self.settings.poll_s)))
-        # Objects loaded by now stay alive: a garbage collection that walks them would delay requests.
-        gc.collect()
-        gc.freeze()
-
-    async def stop(self) -> None:
-        """End the background tasks, close connections and complete the recording."""
-        for task in self._tasks:  # none waits with `asyncio.wait_for`, which may lose a cancellation before Python 3.12
+    Raises UsageError, BundleError and UnavailableError.
+    """
+    control, settings = handler.control, handler.settings
+    await control.configure(served)
+    handler.admission.start_clock()
+    sample = partial(metrics.sample, handler) if handler.metrics.folder is not None else None
+    if sample is not None:  # for the other workers to read
+        await sample()
+    background = [
+        repeat(control.files.poll_s, control.follow, "the plan cannot be followed"),
+        control.warn_of_newer(),  # beside the other: the plan is followed even if the look hangs
+    ]
+    if settings.poll_s is not None:
+        background.append(repeat(settings.poll_s, control.load_newer, "looking for new versions failed"))
+    if settings.api_keys_file is not None:
+        background.append(repeat(current_keys.PERIOD_S, handler.keys.refresh, "the API keys cannot be reread"))
+    if sample is not None:
+        background.append(repeat(metrics.EVERY_S, sample, "the metrics cannot be sampled"))
+    tasks = [asyncio.create_task(each) for each in background]
+    # Objects loaded by now stay alive: a garbage collection that walks them would delay requests.
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        for task in tasks:  # none waits with `asyncio.wait_for`, which may lose a cancellation before Python 3.12
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self.handler.close()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def repeat(period_s: float, step: Callable[[], Awaitable[set[str] | None]], fault: str) -> None:
+    """Repeat a step until cancelled; log what it returns or raises, each sentence once until it is gone."""
+    logged: set[str] = set()
+    while True:
+        await asyncio.sleep(period_s)
+        bug = None
+        try:
+            wrong = await step() or set()
+        except Exception as error:  # it may be out of reach for a while
+            wrong, bug = {str(error)}, None if isinstance(error, RlservoError) else error
+        for sentence in sorted(wrong - logged):
+            logger.warning("%s, serving continues unchanged: %s", fault, sentence, exc_info=bug)
+        logged = wrong

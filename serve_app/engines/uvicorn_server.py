@@ -33,17 +33,18 @@ from rlservo.serve_app.engines.connection_bounds import (
     BoundedWebSocket,
 )
 from rlservo.serve_app.engines.ports import BACKLOG, listen
-from rlservo.serve_app.engines.server_process import Serving
+from rlservo.serve_app.engines.server_process import running
+from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.repository.storage import place_of
-from rlservo.serve_app.server.admin_key import operator_key
-from rlservo.serve_app.server.api_keys import Role, check_exposure
+from rlservo.serve_app.server.api_keys import Role, check_exposure, new_key
 from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.metrics import FOLDER_VARIABLE, shared_by_workers
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import load_served
+from rlservo.serve_app.server.start_check import load_served, plan_follower
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.wire.addresses import is_loopback
+from rlservo.serve_app.wire.admin_key_file import written_key
 from rlservo.serve_app.wire.asgi import ASGIApp, Receive, Scope, Send
 
 logger = logging.getLogger(__name__)
@@ -112,9 +113,11 @@ def serve_policies(
         listener = stack.enter_context(contextlib.closing(listen(host, port)))
         if grpc_port is not None:
             listen(host, grpc_port, option="--grpc-port").close()
-        digest = "" if admin_key_file is None else stack.enter_context(operator_key(admin_key_file))
-        if digest:
-            chosen = chosen.model_copy(update={"operator_key": digest})
+        key, line = new_key("operator", admin=True)
+        if admin_key_file is not None and stack.enter_context(written_key(admin_key_file, key)):
+            chosen = chosen.model_copy(update={"operator_key": line.split()[-1]})
+        else:
+            admin_key_file = None
         server = EmbeddedServer(
             tuple(place_of(place) for place in places), host, grpc_port, workers, chosen, dict(served or {})
         )
@@ -125,19 +128,19 @@ def serve_policies(
         def ready(store: PolicyStore) -> None:
             policies = tuple((name, store.default(name)) for name in store.names)
             if on_ready is not None:
-                on_ready(RunningServer(url, policies, grpc, admin_key_file if digest else None))
+                on_ready(RunningServer(url, policies, grpc, admin_key_file))
 
         if workers > 1:
             _run_workers(server, listener, ready, stopping)
             return
         server.on_ready = ready
-        running = _Server(server.config(), stopping, stop)
+        process = _Server(server.config(), stopping, stop)
         configure(chosen)
         UVICORN.setLevel(logging.CRITICAL)  # our exception reports a failed start
         if in_main:
-            stack.enter_context(_stop_signals(lambda: setattr(running, "should_exit", True)))
+            stack.enter_context(_stop_signals(lambda: setattr(process, "should_exit", True)))
         try:
-            running.run(sockets=[listener])
+            process.run(sockets=[listener])
         except SystemExit:
             raise server.failure or UnavailableError("the server could not start: see its log") from None
 
@@ -187,10 +190,11 @@ class EmbeddedServer:
         if is_worker:
             configure(settings, replica=replica)
             _stop_with_parent()
-        serving = Serving(self.places, settings, replica=replica, host=self.host, is_alone=not is_worker)
-        stack.push_async_callback(serving.stop)
-        await serving.start(self.served)
-        store = serving.handler.store()
+        control = plan_follower(self.places, settings)
+        app = create_app(control, settings, replica=replica, host=self.host, is_alone=not is_worker)
+        stack.push_async_callback(app.handler.close)
+        await stack.enter_async_context(running(app.handler, self.served))
+        store = app.handler.store()
         if settings.default_policy not in (None, *store.names):
             raise UsageError(
                 f"the default policy '{settings.default_policy}' is not served: expected {', '.join(store.names)}"
@@ -198,11 +202,11 @@ class EmbeddedServer:
         if self.grpc_port is not None:
             from rlservo.serve_app.engines.grpc_server import GrpcServer  # takes a quarter of the start
 
-            grpc = GrpcServer(serving.handler, self.host, self.grpc_port, is_shared=is_worker)
+            grpc = GrpcServer(app.handler, self.host, self.grpc_port, is_shared=is_worker)
             await grpc.start()
             stack.push_async_callback(grpc.stop)
-        state[HANDLER] = serving.handler
-        self.app = serving.app
+        state[HANDLER] = app.handler
+        self.app = app
         if self.on_ready is not None:
             self.on_ready(store)
 
@@ -269,7 +273,7 @@ def _run_workers(
     on_stop: Callable[[], None],
 ) -> None:
     # Faults of the policies are reported here, once, before any worker starts.
-    store = load_served(server.places, ServedConfig.parse(server.served), server.settings)
+    store = load_served(server.places, server.served, server.settings)
     store.close()
     UVICORN.setLevel(logging.INFO)
     with _stop_signals(lambda: None), shared_by_workers():  # the first restores the supervisor's signal handlers

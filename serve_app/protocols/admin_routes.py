@@ -22,20 +22,19 @@ from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import OK
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed, Command, Load, Unload, parse
-from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan
 
 MOST_BYTES = 8 << 20  # of a recording, in a reply
 
 
-def routes(handler: RequestHandler, control: PlanFollower) -> list[Route]:
+def routes(handler: RequestHandler) -> list[Route]:
     """Return the routes of /v1/admin, and the repository extension's load and unload."""
 
     async def carry_out(call: Call, command: Command) -> Plan:
         name, entry = call.params["name"], call.audit
         entry.command, entry.policy, entry.change = command.verb, name, command.line(name)
         entry.version = getattr(command, "version", None)
-        after = await control.give(command, name)
+        after = await handler.control.give(command, name)
         entry.code, entry.generation = OK, after.generation
         return after
 

@@ -41,7 +41,7 @@ from rlservo.serve_app.server.access_checks import (
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.server.metrics import exposition
-from rlservo.serve_app.server.request_handler import RequestHandler, StoreProvider
+from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.wire.asgi import Receive, Scope, Send
@@ -51,28 +51,27 @@ numbers = itertools.count(1)
 
 
 def create_app(
-    store_provider: StoreProvider,
+    control: PlanFollower,
     settings: ServerSettings,
     *,
     replica: str = "",
-    control: PlanFollower | None = None,
     host: str = "127.0.0.1",
     is_behind_serve: bool = False,
     is_alone: bool = True,
 ) -> PolicyApp:
-    """Return the application; `store_provider` gives None for as long as the policies are being loaded.
+    """Return the application; `control` need not have loaded anything yet.
 
-    A `control` makes the served policies administrable. `replica` is the `RequestHandler`'s; `host` is the address that
-    it listens on; `is_behind_serve` is `PolicyApp`'s; `is_alone` says that requests reach only this process. Raises
-    UsageError when the API keys that `settings` name cannot be read.
+    `replica` is the `RequestHandler`'s; `host` is the address that it listens on; `is_behind_serve` is `PolicyApp`'s;
+    `is_alone` says that requests reach only this process. Raises UsageError when the API keys that `settings` name
+    cannot be read.
     """
-    handler = RequestHandler(store_provider, settings, replica=replica, control=control, is_alone=is_alone)
+    handler = RequestHandler(control, settings, replica=replica, is_alone=is_alone)
     checks = OriginChecks(host, settings, keyed=bool(handler.keys.accepted.keys))
     routes = [
         *json_codec.routes(handler),
         *websocket_stream.routes(handler),
         *_health(handler),
-        *(admin_routes.routes(handler, control) if control is not None else ()),
+        *admin_routes.routes(handler),
         *infer.routes(handler),
         *model_info.routes(handler),
         *pages.routes(lambda: table),

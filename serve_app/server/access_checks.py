@@ -15,6 +15,7 @@ import ipaddress
 import re
 import socket
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
@@ -125,20 +126,19 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
     return key
 
 
+@dataclass(frozen=True)
 class StreamKey:
     """The key of an open stream, checked and counted with every request: it may have been removed since."""
 
-    def __init__(self, keys: CurrentKeys, presented: bytes | None) -> None:
-        """Nothing is checked before the first request."""
-        self._keys = keys
-        self._presented = presented
+    keys: CurrentKeys
+    presented: bytes | None
 
     def check(self) -> bool:
         """Return whether the key may ask for exploring actions.
 
         Raises as `authorize` does; RateLimitError concerns only this request.
         """
-        key = authorize(self._keys, self._presented, Access.act)
+        key = authorize(self.keys, self.presented, Access.act)
         return key is None or key.may_explore
 
 

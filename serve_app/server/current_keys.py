@@ -1,28 +1,27 @@
 """API keys in use: each process rereads their file while the server runs, and limits their rate by itself.
 
-The file is read twice a second in a thread of its own: a file system that hangs must not delay actions. Its whole
-content is compared, so it does not matter how it was changed: written in place, renamed over, or behind the symbolic
-links that Kubernetes swaps. Content with which a server would not start changes nothing, and is logged once.
+The file's whole content is compared, so it does not matter how it was changed: written in place, renamed over, or
+behind the symbolic links that Kubernetes swaps. Content with which a server would not start changes nothing, and is
+logged once.
 """
 
 from __future__ import annotations
 
 import logging
-import threading
 import time
-import weakref
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from rlservo.export.contract.errors import RateLimitError, UsageError
+from rlservo.export.contract.errors import RateLimitError, UnavailableError, UsageError
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, read_key_file
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 
 logger = logging.getLogger(__name__)
 
 PERIOD_S = 0.5  # [s] between reads; content is used once two in a row agree, as one may catch a half-written file
-STALE_S = 10.0  # [s] without an answer from the file system until the keys count as outdated
+READ_S = 5.0  # [s] for one read; after two without an answer from the file system the keys count as outdated
 ROUNDING_S = 1e-6
 
 
@@ -52,69 +51,44 @@ class RateLimits:
 
 
 class CurrentKeys:
-    """`Keys` that follow their file while this object exists."""
+    """`Keys` that follow their file as long as `refresh` is called."""
 
     def __init__(self, settings: ServerSettings) -> None:
         """Read the keys that the settings name, as `Keys.from_settings` does. Raises UsageError."""
         self._settings = settings
-        file = settings.api_keys_file
-        content = None if file is None else read_key_file(Path(file))
-        self.accepted = Keys.from_settings(settings, file_content=content)
+        self.accepted = Keys.from_settings(settings)
         """The keys that are accepted now: another object after every change."""
-        self.limits = RateLimits()
-        self._seen: bytes | str | None = content  # or the reason why it could not be read
-        self._used: bytes | str | None = content
-        self._is_refused = False
-        self._looked_at = time.monotonic()
-        if file is not None:
-            watcher = threading.Thread(target=_watch, args=(weakref.ref(self),), name="key-file", daemon=True)
-            watcher.start()
-
-    @property
-    def current(self) -> bool:
+        self.current = True
         """Whether these are the file's current keys; False if the file cannot be used or read."""
-        if self._settings.api_keys_file is None:
-            return True
-        return not self._is_refused and time.monotonic() - self._looked_at < STALE_S
+        self.limits = RateLimits()
+        self._calls = BlockingCalls(READ_S)
+        self._seen: bytes | str | None = None  # the file's content, or the reason why it could not be read
+        self._used: bytes | str | None = None
 
-    def refresh(self) -> None:
+    async def refresh(self) -> None:
         """Read the file; use its content once two reads in a row have seen the same."""
         assert self._settings.api_keys_file is not None
-        seen: bytes | str
+        file, before = Path(self._settings.api_keys_file), self._seen
         try:
-            seen = read_key_file(Path(self._settings.api_keys_file))
+            self._seen = await self._calls.run("reading the API keys", read_key_file, file)
         except UsageError as error:
-            seen = error.message
-        before, self._seen, self._looked_at = self._seen, seen, time.monotonic()
-        if seen != before or seen == self._used:
+            self._seen = error.message
+        except UnavailableError:
+            self._seen = f"{file} could not be read within {READ_S:g} s: does the file system hang?"
+        if self._seen != before or self._seen == self._used:
             return
-        self._used = seen
+        self._used = self._seen
         try:
-            if isinstance(seen, str):
-                raise UsageError(seen)
-            keys = Keys.from_settings(self._settings, file_content=seen)
+            if isinstance(self._seen, str):
+                raise UsageError(self._seen)
+            keys = Keys.from_settings(self._settings, file_content=self._seen)
         except UsageError as error:
-            self._is_refused = True
+            self.current = False
             logger.error("the API keys were not changed: %s", error.message)
             return
-        if self._is_refused or keys != self.accepted:
+        if not self.current or keys != self.accepted:
             logger.warning("the API keys were reread: %s", _difference(self.accepted, keys))
-        self._is_refused = False
-        if keys != self.accepted:
-            self.accepted = keys
-
-
-def _watch(reference: weakref.ref[CurrentKeys]) -> None:
-    while True:
-        time.sleep(PERIOD_S)
-        keys = reference()
-        if keys is None:
-            return
-        try:
-            keys.refresh()
-        except Exception:
-            logger.exception("the API key file cannot be read; the keys were not changed")
-        del keys
+        self.current, self.accepted = True, keys
 
 
 def _difference(before: Keys, after: Keys) -> str:

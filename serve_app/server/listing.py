@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.versions.plan_follower import VersionState
 
 
 def describe(handler: RequestHandler) -> dict[str, Any]:
@@ -16,8 +15,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
     number; `behind` lists the parts of it that this process could not follow.
     """
     store, control = handler.store(), handler.control
-    plan = control.plan if control is not None else None
-    states = states_of(handler)
+    plan, states = control.plan, control.states()
     policies = []
     for name in store.names:
         contract, arranged, shadow = store.get(name).contract, store.plans[name], store.shadow(name)
@@ -37,7 +35,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
                         "version": version,
                         **vars(state),
                         "aliases": [alias for alias, target in arranged.aliases.items() if target == version],
-                        "requests": handler.metrics.requests(name, version),
+                        "requests": sum(each.count for each in handler.metrics.answers_of(name, version)),
                     }
                     for version, state in states.get(name, {}).items()
                 ],
@@ -49,13 +47,5 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
         "generation": plan.generation if plan is not None else 0,
         "changed_at": plan and plan.changed_at,
         "changed_by": plan and plan.changed_by,
-        "behind": list(control.behind) if control is not None else [],
+        "behind": list(control.behind),
     }
-
-
-def states_of(handler: RequestHandler) -> dict[str, dict[str, VersionState]]:
-    """Return the state of every version, by name."""
-    if handler.control is not None:
-        return handler.control.states()
-    store = handler.store()
-    return {name: {version: VersionState("ready") for version in store.versions(name)} for name in store.names}

@@ -78,30 +78,24 @@ def configure(settings: ServerSettings, *, replica: str = "") -> None:
         each.addHandler(handler)
 
 
-class RequestLog:
-    """Writes the outcome of requests."""
+def write_answer(request: Request, decision: Decision, seconds: float) -> None:
+    """Write a request that got its action."""
+    fields = _fields(request, decision.name, decision.version, OK, seconds)
+    fields["batch"] = decision.batch or 1
+    _requests.info("answered", extra={FIELDS: fields})
 
-    def __init__(self, settings: ServerSettings) -> None:
-        self.every = settings.log_requests
-        self._values = settings.log_values
 
-    def write_answer(self, request: Request, decision: Decision, seconds: float) -> None:
-        """Write a request that got its action; check `every` first."""
-        fields = _fields(request, decision.name, decision.version, OK, seconds)
-        fields["batch"] = decision.batch or 1
-        _requests.info("answered", extra={FIELDS: fields})
-
-    def write_failure(self, request: Request, code: str, sentence: str) -> None:
-        """Write a request that got no action."""
-        if not _requests.isEnabledFor(logging.INFO):
-            return
-        version = request.version and request.version[:32]
-        fields = _fields(request, request.policy[:64], version, code, time.perf_counter() - request.received)
-        if request.peer is not None:
-            fields["peer"] = request.peer
-        if self._values:
-            fields["error"] = sentence
-        _requests.info("refused", extra={FIELDS: fields})
+def write_failure(request: Request, code: str, sentence: str | None) -> None:
+    """Write a request that got no action, with an error's sentence if values may be logged."""
+    if not _requests.isEnabledFor(logging.INFO):
+        return
+    version = request.version and request.version[:32]
+    fields = _fields(request, request.policy[:64], version, code, time.perf_counter() - request.received)
+    if request.peer is not None:
+        fields["peer"] = request.peer
+    if sentence is not None:
+        fields["error"] = sentence
+    _requests.info("refused", extra={FIELDS: fields})
 
 
 def _fields(request: Request, policy: str, version: str | None, code: str, seconds: float) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-import logging
 import math
 import os
 import tempfile
@@ -37,8 +36,6 @@ from rlservo.serve_app.versions.policy_store import Decision
 if TYPE_CHECKING:
     from rlservo.serve_app.server.request_handler import RequestHandler
 
-logger = logging.getLogger(__name__)
-
 FOLDER_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"  # read by prometheus_client when it is imported
 EVERY_S = 1.0
 MAX_ELEMENTS = 128  # not a series for each pixel of an image: only the largest is shown
@@ -60,18 +57,6 @@ def shared_by_workers() -> Iterator[None]:
             del os.environ[FOLDER_VARIABLE]
 
 
-@dataclass(frozen=True)
-class Totals:
-    """Answers of one version of a policy since the start, over all protocols."""
-
-    requests: int
-    failures: int
-    observations: int
-    request_s: float
-    inference_s: float
-    last_answer_ms: int  # since 1970; 0 if there was none
-
-
 @dataclass(slots=True)
 class Answers:
     """Answered requests to one version of a policy over one protocol."""
@@ -89,7 +74,7 @@ class Metrics(Collector):
 
     def __init__(self, replica: str = "") -> None:
         self._replica = replica
-        self._folder = os.environ.get(FOLDER_VARIABLE)
+        self.folder = os.environ.get(FOLDER_VARIABLE)  # that several workers share
         self._registry = registry = CollectorRegistry()
         self._counted = CollectorRegistry()  # what is sampled
         self._sampled: dict[str, Any] = {}  # counters and gauges by name
@@ -114,11 +99,6 @@ class Metrics(Collector):
         self.answers: dict[tuple[str, str, str], Answers] = {}  # by policy, version, protocol
         self.failures: Counter[tuple[str, str, str, str]] = Counter()  # by the same and the error's code
         self.ends: Counter[tuple[str, str, bool]] = Counter()  # by policy, version and success
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether several workers share their metrics."""
-        return self._folder is not None
 
     def record_answer(self, protocol: str, decision: Decision, seconds: float) -> None:
         """Count a request that got its action `seconds` after it arrived."""
@@ -151,22 +131,9 @@ class Metrics(Collector):
         for difference in differences:
             histogram.observe(difference)
 
-    def requests(self, policy: str, version: str) -> int:
-        """Return the number of requests to a version that this process has answered, over all protocols."""
-        return sum(answers.count for key, answers in self.answers.items() if key[:2] == (policy, version))
-
-    def totals(self, policy: str, version: str) -> Totals:
-        """Return the sums over a version's requests; failures that did not ask for an action do not count."""
-        found = [answers for key, answers in self.answers.items() if key[:2] == (policy, version)]
-        failed = (count for key, count in self.failures.items() if key[:2] == (policy, version) and key[3] != IDLE)
-        return Totals(
-            requests=sum(answers.count for answers in found),
-            failures=sum(failed),
-            observations=sum(answers.observations for answers in found),
-            request_s=sum(_sum_of(answers.latency) for answers in found),
-            inference_s=sum(_sum_of(answers.inference) for answers in found),
-            last_answer_ms=round(1e3 * max((answers.last_s for answers in found), default=0.0)),
-        )
+    def answers_of(self, policy: str, version: str) -> list[Answers]:
+        """Return the answers of a version since the start, one for each protocol."""
+        return [answers for key, answers in self.answers.items() if key[:2] == (policy, version)]
 
     def counter(self, name: str, documentation: str, total: float, **labels: str) -> None:
         """Raise a counter to a total; a smaller total than before has restarted from zero."""
@@ -199,22 +166,21 @@ class Metrics(Collector):
 
     def text(self) -> bytes:
         """Return all metrics as Prometheus reads them: of this process, or of all workers."""
-        registry = CollectorRegistry()
-        registry.register(self)
-        return generate_latest(registry)
+        return generate_latest(self)
 
     def collect(self) -> Iterator[Metric]:
         """Yield the current metric families."""
         # Counters come first here and in the files: no answer is counted before it is timed.
         own = itertools.chain(self._counted.collect(), self._registry.collect())
-        for family in own if self._folder is None else _of_all_workers(Path(self._folder)):
+        for family in own if self.folder is None else _of_all_workers(Path(self.folder)):
             family.samples = [
                 each for each in family.samples if not math.isnan(each.value) and not each.name.endswith("_created")
             ]
             yield family
 
 
-def _sum_of(histogram: Histogram) -> float:
+def sum_of(histogram: Histogram) -> float:
+    """Return the sum of a histogram's values."""
     (family,) = histogram.collect()
     return next(sample.value for sample in family.samples if sample.name.endswith("_sum"))
 
@@ -236,21 +202,11 @@ def _of_all_workers(folder: Path) -> Iterable[Metric]:
 
 async def exposition(handler: RequestHandler) -> bytes:
     """Return all metrics as Prometheus reads them."""
-    sample(handler)
+    await sample(handler)
     return await asyncio.to_thread(handler.metrics.text)  # thousands of series take a while
 
 
-async def keep_sampled(handler: RequestHandler) -> None:
-    """Sample until cancelled, for the other workers to read."""
-    while True:
-        try:
-            sample(handler)
-        except Exception:  # a fault in one metric must not stop the others
-            logger.exception("the metrics could not be sampled")
-        await asyncio.sleep(EVERY_S)
-
-
-def sample(handler: RequestHandler) -> None:
+async def sample(handler: RequestHandler) -> None:
     """Bring all counters and gauges up to date."""
     for part in (requests, versions, process, sessions):
         part(handler)
@@ -277,10 +233,13 @@ def requests(handler: RequestHandler) -> None:
 def versions(handler: RequestHandler) -> None:
     """Sample the plan that this process follows, and each version's default flag, batches and drift."""
     show = handler.metrics
-    if handler.control is not None and handler.control.plan is not None:
-        show.gauge("rlservo_plan_generation", "Plan that this process follows", handler.control.plan.generation)
-    for name, version, policy in handler.policies():
-        which, is_default = {"policy": name, "version": version}, version == handler.store().default(name)
+    plan, store = handler.control.plan, handler.control.store
+    if plan is None or store is None:
+        return
+    show.gauge("rlservo_plan_generation", "Plan that this process follows", plan.generation)
+    for policy in store.policies:
+        name, version = policy.contract.name, policy.contract.version
+        which, is_default = {"policy": name, "version": version}, version == store.default(name)
         show.gauge("rlservo_policy_loaded", "1 for the default version, 0 for the others", is_default, **which)
         drift = policy.drift
         if drift is None:

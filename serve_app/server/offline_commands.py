@@ -8,9 +8,8 @@ from typing import Any
 
 from rlservo.export.contract.errors import RequestError, UsageError
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import loader_and_plans
+from rlservo.serve_app.server.start_check import plan_follower
 from rlservo.serve_app.versions.plan_commands import Changed, parse
-from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan
 
 
@@ -19,7 +18,7 @@ class OfflineCommands:
 
     def __init__(self, places: Sequence[str]) -> None:
         """Take the places that `rlservo serve` gets, in the same order. Raises UsageError."""
-        self._loader, self._files = loader_and_plans(places, ServerSettings.from_environment())
+        self._control = plan_follower(places, ServerSettings.from_environment())
 
     def command(self, name: str, command: str, document: dict[str, Any]) -> dict[str, Any]:
         """Carry out a command on a policy; return its new listing, as the server would."""
@@ -27,8 +26,8 @@ class OfflineCommands:
             given = parse(command, document)
         except RequestError as error:
             raise UsageError(error.message) from None
-        plan = asyncio.run(PlanFollower(self._loader, self._files).write(given, name))
-        return {**Changed.of(plan, name).model_dump(), "place": self._files.place}
+        plan = asyncio.run(self._control.write(given, name))
+        return {**Changed.of(plan, name).model_dump(), "place": self._control.files.place}
 
     def listing(self) -> dict[str, Any]:
         """Return the newest plan, and for each policy the versions of the repository that it does not load.
@@ -38,8 +37,9 @@ class OfflineCommands:
         return asyncio.run(self._listing())
 
     async def _listing(self) -> dict[str, Any]:
-        plan = await self._files.call(self._files.newest)
-        listing = await self._loader.look()
+        files = self._control.files
+        plan = await files.call(files.newest)
+        listing = await self._control.loader.look()
         if plan is None:
             if not listing.digests:
                 listing.available(needs_all=True)
@@ -50,7 +50,7 @@ class OfflineCommands:
             others[name] = [version for version in versions if version not in loaded]
         described = {name: Changed.of(plan, name).model_dump(exclude={"generation", "policy"}) for name in others}
         return {
-            "place": self._files.place,
+            "place": files.place,
             "generation": plan.generation,
             "changed_by": plan.changed_by or None,
             "changed_at": plan.changed_at or None,

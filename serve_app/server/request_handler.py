@@ -13,7 +13,6 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from rlservo.export.contract.errors import (
@@ -29,13 +28,12 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.episodes.episodes import Episodes
 from rlservo.serve_app.episodes.request import NO_EPISODE, ClientGoneError, Request, check_deadline
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.current_keys import CurrentKeys
-from rlservo.serve_app.server.logs import FIELDS, RequestLog
+from rlservo.serve_app.server.logs import FIELDS, write_answer, write_failure
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.settings import MEMORY, ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
@@ -52,7 +50,6 @@ STRICTER = "stricter-than-production"
 NO_EXPLORING = "this API key may not request exploring actions: leave 'explore' out, or use a key of role 'explore'"
 BUG = "the server failed on this request; its log has the cause"
 
-StoreProvider = Callable[[], PolicyStore | None]
 Source = TypeVar("Source", contravariant=True)
 Reply = TypeVar("Reply", covariant=True)
 
@@ -78,23 +75,20 @@ class RequestHandler:
 
     def __init__(
         self,
-        store_provider: StoreProvider,
+        control: PlanFollower,
         settings: ServerSettings,
         replica: str = "",
         *,
-        control: PlanFollower | None = None,
         is_alone: bool = True,
     ) -> None:
-        """`store_provider` gives None for as long as the policies are being loaded.
+        """Take what is served, which may still be loading, and read the keys that `settings` name.
 
-        Reads the keys that `settings` name; `replica` names this process in the metrics; with a `control` what is
-        served can change while the server runs; `is_alone` says whether every request reaches this process.
+        `replica` names this process in the metrics; `is_alone` says whether every request reaches this process.
         Raises UsageError.
         """
         self.control = control
         self.replica = replica
         self.keys = CurrentKeys(settings)
-        self._store_provider = store_provider
         self.settings = settings
         self.admission = Admission(settings)
         sessions = None
@@ -107,7 +101,6 @@ class RequestHandler:
             max_sessions=settings.max_sessions, idle_s=settings.session_idle_s, store=sessions, is_alone=is_alone
         )
         self.metrics = Metrics(replica)
-        self.log = RequestLog(settings)
         self.shadows = Shadows(self.metrics.record_differences)
         self.recorder: RequestRecorder | None = None
         if settings.record is not None:
@@ -123,17 +116,9 @@ class RequestHandler:
         if self.recorder is not None:
             await asyncio.to_thread(self.recorder.close)
 
-    def policies(self) -> Iterator[tuple[str, str, Policy]]:
-        """Yield (name, version, policy) of every loaded version."""
-        store = self._store_provider()
-        if store is not None:
-            for name in store.names:
-                for version in store.versions(name):
-                    yield name, version, store.get(name, version)
-
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
-        store = self._store_provider()
+        store = self.control.store
         if store is None:
             raise UnavailableError("the policies are still being loaded: try again shortly")
         return store
@@ -166,7 +151,7 @@ class RequestHandler:
         except RlservoError as error:
             self.record_failure(request, error)
             if self.recorder is not None:
-                self.recorder.note_failure(request, self._store_provider(), error)
+                self.recorder.note_failure(request, self.control.store, error)
             raise
         except Exception as error:
             self.record_bug(request, asked=blamed_version(error))
@@ -177,8 +162,8 @@ class RequestHandler:
             self._count_end(request, decision, request.episode.final_status)
         if self.recorder is not None:
             self.recorder.note_answer(request, decision, taken)
-        if self.log.every:
-            self.log.write_answer(request, decision, taken)
+        if self.settings.log_requests:
+            write_answer(request, decision, taken)
         return reply
 
     async def decide(self, request: Request) -> Decision:
@@ -204,7 +189,7 @@ class RequestHandler:
         Requests for unknown names share one count.
         """
         name, version, asked = request.policy, request.version, blamed_version(error)
-        store, code = self._store_provider(), code or error.code
+        store, code = self.control.store, code or error.code
         counted_as = code
         if store is None or name not in store.names:
             name = version = ""
@@ -215,7 +200,7 @@ class RequestHandler:
         else:  # an alias counts as its version, no version as the default
             version = store.default(name) if version is None else store.plans[name].version_of(version) or ""
         self.metrics.count_failure(request.protocol, name, version, counted_as)
-        self.log.write_failure(request, code, error.message)
+        write_failure(request, code, error.message if self.settings.log_values else None)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
         """Count a request that failed with the current exception, and log its traceback."""

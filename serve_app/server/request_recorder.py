@@ -190,12 +190,9 @@ class RequestRecorder:
 
 def _episode_of(request: Request) -> str:
     """Return a request's episode: its session, its stream, or everything under its label."""
-    return _session_of(request) or request.stream_id or shorten_label(request.label or "")
-
-
-def _session_of(request: Request) -> str | None:
     session_id = request.episode.session_id
-    return f"#{session_id}" if isinstance(session_id, int) else session_id  # 7 and "7" are different sessions
+    session = f"#{session_id}" if isinstance(session_id, int) else session_id  # 7 and "7" are different sessions
+    return session or request.stream_id or shorten_label(request.label or "")
 
 
 def _request_id(request: Request) -> str | None:

@@ -7,11 +7,10 @@ time-out, and nothing is locked meanwhile: requests and other changes continue, 
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,8 +53,8 @@ class PlanFollower:
     def __init__(self, loader: VersionLoader, files: PlanFiles) -> None:
         self.store: PolicyStore | None = None
         self.plan: Plan | None = None
-        self._loader = loader
-        self._files = files
+        self.loader = loader
+        self.files = files
         self._failed: dict[Loadable, RlservoError] = {}  # why this process serves something older than the plan
         self._refused: dict[Key, str] = {}  # by the last command that this process carried out
         self._refused_until: dict[Loadable, float] = {}  # new versions that polling leaves out for a while
@@ -77,9 +76,9 @@ class PlanFollower:
         """
         self._config = ServedConfig.parse(document)
         try:
-            plan = await self._files.call(self._files.newest)
+            plan = await self.files.call(self.files.newest)
         except UnavailableError as error:
-            plan = await self._files.call(self._files.remembered)
+            plan = await self.files.call(self.files.remembered)
             if plan is None:
                 raise
             logger.warning("%s: serving plan %d, the last one that was seen here", error.message, plan.generation)
@@ -89,7 +88,7 @@ class PlanFollower:
             logger.warning(
                 "plan %d in %s (%s) differs from the configuration and is used: `rlservo policy` changes it",
                 plan.generation,
-                self._files.place,
+                self.files.place,
                 plan.changed_by,
             )
         await self._apply(plan)
@@ -116,11 +115,11 @@ class PlanFollower:
         """
         try:
             if isinstance(command, Load):
-                command = Load.of(*(await self._loader.look()).find(name, command.version))
-            before = await self._files.call(self._files.newest)
+                command = Load.of(*(await self.loader.look()).find(name, command.version))
+            before = await self.files.call(self.files.newest)
             known = 0 if self.plan is None else self.plan.generation
             if (0 if before is None else before.generation) < known:
-                raise UnavailableError(f"{self._files.place} has lost plan {known}, which is served here")
+                raise UnavailableError(f"{self.files.place} has lost plan {known}, which is served here")
             return await self._write(before or await self._unwritten(), command, name)
         except (BundleError, UsageError) as error:  # of the repository, of the proof
             raise RefusedError(f"refused, and nothing has changed: {error.message}", error.details) from None
@@ -131,10 +130,10 @@ class PlanFollower:
             policies = before.policies if command is None else command.change(before, name)
             if policies == before.policies and before.generation:
                 return before
-            await self._loader.prove(policies, before.policies if before.generation else {})
+            await self.loader.prove(policies, before.policies if before.generation else {})
             plan = before.after(policies, "configuration" if command is None else command.line(name))
             try:
-                if await self._files.call(self._files.create, plan):
+                if await self.files.call(self.files.create, plan):
                     return plan
             except UnavailableError as error:
                 if before.generation:
@@ -143,9 +142,9 @@ class PlanFollower:
                     f"{error.message}: the first plan could not be written; RLSERVO_PLAN names another place for it, "
                     "and `rlservo policy load NAME --repository PLACE` writes it for servers that only read"
                 ) from None
-            first = await self._files.call(self._files.newest)
+            first = await self.files.call(self.files.newest)
             if first is None:
-                raise UnavailableError(f"{self._files.place} has lost the plan that was just there")
+                raise UnavailableError(f"{self.files.place} has lost the plan that was just there")
             ours, theirs = (differences(before.policies, each, name) for each in (policies, first.policies))
             if ours.items() <= theirs.items():
                 return first  # another operator has given the same command
@@ -159,7 +158,7 @@ class PlanFollower:
 
     async def _unwritten(self) -> Plan:
         """Return the plan before the first, which is not written."""
-        return Plan(generation=0, policies=first_policies(self._config, await self._loader.look()))
+        return Plan(generation=0, policies=first_policies(self._config, await self.loader.look()))
 
     def _generation(self) -> int:
         if self.plan is None:
@@ -170,35 +169,27 @@ class PlanFollower:
 
     async def follow(self) -> None:
         """Serve the newest plan if another one is served, and try again what could not be loaded a while ago."""
-        plan = await self._files.call(self._files.after, self._generation())
-        can_try_again = any(key[:2] not in self._loader.loading for key in self._failed)
+        plan = await self.files.call(self.files.after, self._generation())
+        can_try_again = any(key[:2] not in self.loader.loading for key in self._failed)
         if can_try_again and time.monotonic() - self._tried_at > RETRY_PERIOD_S:
             plan = plan or self.plan
         if plan is not None:
             await self._apply(plan)
 
-    async def poll_plan(self) -> None:
-        """Follow the plans that others write, until cancelled."""
-        always = _always(self._files.poll_s, self.follow, "the plan cannot be followed")
-        await asyncio.gather(self._warn_of_newer(), always)  # the plan is followed even if the look hangs
-
-    async def _warn_of_newer(self) -> None:
+    async def warn_of_newer(self) -> None:
+        """Log which versions are newer than the plan's, and not loaded."""
         with contextlib.suppress(Exception):  # the repository may be out of reach
-            if newer := self._newer((await self._loader.look()).digests):
+            if newer := self._newer((await self.loader.look()).digests):
                 shown = ", ".join(" ".join(key) for key in newer[:10])
                 newest = f"newer than the versions of plan {self._generation()}, and not loaded: {shown}"
                 logger.warning("%s (`rlservo policy load`)", newest)
 
-    async def poll_repository(self, period_s: float) -> None:
-        """Load versions newer than all that the plan knows of a policy, as the command `load` does, until cancelled.
+    async def load_newer(self) -> set[str]:
+        """Load versions newer than all that the plan knows of a policy, as the command `load` does; return the faults.
 
         Versions that the configuration leaves out are left out here, and so are those that an operator has unloaded.
         """
-        await _always(period_s, self._load_newer, "looking for new versions failed")
-
-    async def _load_newer(self) -> set[str]:
-        """Load the newer versions; return what was wrong with others."""
-        listing = await self._loader.look()
+        listing = await self.loader.look()
         digests, wrong = listing.digests, {error.message for error in listing.errors.values()}
         for name, version in self._newer(digests):
             key = (name, version, digests[name][version])
@@ -227,12 +218,12 @@ class PlanFollower:
 
     def states(self) -> dict[str, dict[str, VersionState]]:
         """Return the state of every version that is served, should be, or was refused, by name."""
-        states = {key: VersionState("loading") for key in self._loader.loading}
+        states = {key: VersionState("loading") for key in self.loader.loading}
         states |= {key: VersionState("failed", reason) for key, reason in self._refused.items()}
         states |= {key[:2]: VersionState("failed", error.message) for key, error in self._failed.items()}
         for name, policy in ({} if self.store is None else self.store.plans).items():
             for key in policy.loadables(name):
-                if (loaded := self._loader.get(key)) is not None:
+                if (loaded := self.loader.get(key)) is not None:
                     reason = states[key[:2]].reason if key[:2] in states else ""
                     since = loaded.loaded_at.isoformat(timespec="milliseconds")
                     states[key[:2]] = VersionState("ready", reason, since)
@@ -246,11 +237,11 @@ class PlanFollower:
 
         Raises BundleError if this process serves nothing yet and a default version cannot be loaded.
         """
-        self._tried_at, loading = time.monotonic(), self._loader.loading
+        self._tried_at, loading = time.monotonic(), self.loader.loading
         wanted = [key for name, policy in plan.policies.items() for key in policy.loadables(name)]
         # A version that is still loading is not waited for again: a file system may hang.
         hanging = {key: error for key, error in self._failed.items() if key in wanted and key[:2] in loading}
-        found = hanging | await self._loader.load_all(key for key in wanted if key not in hanging)
+        found = hanging | await self.loader.load_all(key for key in wanted if key not in hanging)
         if self.plan is not None and plan.generation < self.plan.generation:
             return  # a later plan has been served while this one was loading
         failed = {key: each for key, each in found.items() if isinstance(each, RlservoError)}
@@ -265,15 +256,15 @@ class PlanFollower:
                     continue  # not served here rather than as another version; `behind` reports it
                 raise BundleError(
                     f"policy '{name}' cannot be served as version {policy.default}, its default in plan "
-                    f"{plan.generation} of {self._files.place}: {errors[policy.default].message}"
+                    f"{plan.generation} of {self.files.place}: {errors[policy.default].message}"
                 )
             serving[name] = policy
         kept: dict[Loadable, Policy] = {}
         for key in (key for name, policy in serving.items() for key in policy.loadables(name)):
-            loaded = found[key] if key in found else self._loader.get(key)
+            loaded = found[key] if key in found else self.loader.get(key)
             if loaded is not None and not isinstance(loaded, RlservoError):
                 kept[key] = loaded
-        self._loader.keep(kept)
+        self.loader.keep(kept)
         self.store = PolicyStore(kept.values(), serving, self.store)
         self.plan = plan
         self._failed = failed
@@ -281,17 +272,3 @@ class PlanFollower:
             logger.error("plan %d cannot be served as it should: %s", plan.generation, "; ".join(self.behind))
         else:
             logger.info("serving plan %d (%s)", plan.generation, plan.changed_by)
-
-
-async def _always(period_s: float, step: Callable[[], Awaitable[set[str] | None]], fault: str) -> None:
-    """Repeat a step until cancelled; log what it returns or raises, each sentence once until it is gone."""
-    logged: set[str] = set()
-    while True:
-        await asyncio.sleep(period_s)
-        try:
-            wrong = await step() or set()
-        except Exception as error:  # it may be out of reach for a while
-            wrong = {str(error)}
-        for sentence in sorted(wrong - logged):
-            logger.warning("%s, serving continues unchanged: %s", fault, sentence)
-        logged = wrong

@@ -95,6 +95,11 @@ class PolicyStore:
         """The policies' names, sorted."""
         return tuple(sorted(self._served))
 
+    @property
+    def policies(self) -> list[Policy]:
+        """Every loaded version."""
+        return [policy for served in self._served.values() for policy in served.versions.values()]
+
     def versions(self, name: str) -> tuple[str, ...]:
         """The versions of a policy, oldest first. Raises UnknownPolicyError."""
         return tuple(self._find(name).versions)
@@ -168,9 +173,8 @@ class PolicyStore:
 
     def close(self) -> None:
         """Close every policy."""
-        for served in self._served.values():
-            for policy in served.versions.values():
-                policy.close()
+        for policy in self.policies:
+            policy.close()
 
     def _find(self, name: str) -> _Served:
         served = self._served.get(name)

@@ -1,12 +1,20 @@
-"""File with the admin key of a server on this machine: its place follows from the port, so both sides find it."""
+"""File with the admin key that `rlservo serve` makes: only its user can read it, and it is removed with the server.
+
+Its place follows from the port, so that `rlservo policy` on the same machine finds it by itself.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 from rlservo.export.contract.errors import UsageError
+
+logger = logging.getLogger(__name__)
 
 LONGEST_KEY_FILE = 4096  # [bytes] far more than a key
 
@@ -34,3 +42,25 @@ def read_key(file: Path) -> str:
     if not key or len(key.split()) != 1:
         raise UsageError(f"the key file {file} should hold one key and nothing else")
     return key
+
+
+@contextlib.contextmanager
+def written_key(file: Path, key: str) -> Iterator[bool]:
+    """Write a key to `file` and remove it at the end; yield whether it could be written, which is logged if not."""
+    try:
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)  # of a server that was killed
+        # Must be a new file: a file or link that another user put there is not used.
+        descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        with os.fdopen(descriptor, "w") as stream:
+            stream.write(key + "\n")
+    except OSError as error:
+        logger.warning("no admin key for 'rlservo policy': %s cannot be written (%s)", file, error.strerror)
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        with contextlib.suppress(UsageError, OSError):
+            if read_key(file) == key:  # not that of a later server
+                file.unlink()

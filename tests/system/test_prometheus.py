@@ -26,7 +26,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.drift import EVERY
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import ROOT, LiveServer, ask, free_ports
-from stores import load_store
+from stores import control_of, load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -89,7 +89,7 @@ def drifting(
     steps = (BakedStep(step="mean_std_filter", values=still), *contract.baked_in[1:])
     bundle_files.write_contract(folder, contract.model_copy(update={"baked_in": steps}))
     store = load_store(folder)
-    with served(create_app(lambda: store, ServerSettings(), replica="drifting")) as port:
+    with served(create_app(control_of(store), ServerSettings(), replica="drifting")) as port:
         for _ in range(3 * EVERY):
             assert ask(port, "POST", "/v1/policies/ur5/act", {"obs": [4.0] * 27})[0] == 200
         yield port

@@ -24,7 +24,7 @@ from rlservo.serve_app.recording.episodes import episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.runtime.policy import Policy
 from servers import free_ports, launched
-from stores import load_store
+from stores import control_of, load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -211,7 +211,7 @@ def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
 
     async def ask(remaining: float | None) -> list[Any]:
         context = Context()
-        service = Grpc(RequestHandler(lambda: store, ServerSettings()))
+        service = Grpc(RequestHandler(control_of(store), ServerSettings()))
         await service.answer("ModelInfer", (asked.SerializeToString(), remaining), context)
         return context.status
 

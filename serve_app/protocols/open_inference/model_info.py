@@ -30,8 +30,7 @@ from rlservo.serve_app.protocols.request_fields import parse_fields, parse_json,
 from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route, of_policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
-from rlservo.serve_app.server.listing import states_of
-from rlservo.serve_app.server.metrics import Totals
+from rlservo.serve_app.server.metrics import IDLE, Metrics, sum_of
 from rlservo.serve_app.server.request_handler import RequestHandler
 
 PLATFORM = "onnx_onnxv1"
@@ -103,7 +102,7 @@ def repository_index(handler: RequestHandler, *, ready: bool | None = False, **_
     handler.store()
     return [
         {"name": name, "version": version, "state": STATES[state.state], "reason": state.reason}
-        for name, versions in states_of(handler).items()
+        for name, versions in handler.control.states().items()
         for version, state in versions.items()
         if state.state == "ready" or not ready
     ]
@@ -182,24 +181,30 @@ def statistics(handler: RequestHandler, name: str = "", version: str | None = No
         wanted = [(each, known) for each in ([name] if name else store.names) for known in store.versions(each)]
     else:
         wanted = [(name, store.get(name, version).contract.version)]
-    return {"model_stats": [_statistics(handler.metrics.totals(*which), *which) for which in wanted]}
+    return {"model_stats": [_statistics(handler.metrics, *which) for which in wanted]}
 
 
-def _statistics(totals: Totals, name: str, version: str) -> dict[str, Any]:
+def _statistics(metrics: Metrics, name: str, version: str) -> dict[str, Any]:
+    found = metrics.answers_of(name, version)
+    count = sum(each.count for each in found)
+    asked = {key: n for key, n in metrics.failures.items() if key[:2] == (name, version) and key[3] != IDLE}
     # A request is computed as soon as it is read, and `compute_infer` includes the checks of observation and action,
     # which have no time of their own. The counts are equal all the same: perf_analyzer aborts if they differ.
-    seconds = {"success": totals.request_s, "compute_infer": totals.inference_s}
+    seconds = {
+        "success": sum(sum_of(each.latency) for each in found),
+        "compute_infer": sum(sum_of(each.inference) for each in found),
+    }
     seconds |= dict.fromkeys(("queue", "compute_input", "compute_output"), 0.0)
     none = {"count": 0, "ns": 0}
     return {
         "name": name,
         "version": version,
-        "last_inference": totals.last_answer_ms,
-        "inference_count": totals.observations,
-        "execution_count": totals.requests,
+        "last_inference": round(1e3 * max((each.last_s for each in found), default=0.0)),
+        "inference_count": sum(each.observations for each in found),
+        "execution_count": count,
         "inference_stats": {
-            **{part: {"count": totals.requests, "ns": round(taken * 1e9)} for part, taken in seconds.items()},
-            "fail": {"count": totals.failures, "ns": 0},  # their durations are not kept
+            **{part: {"count": count, "ns": round(taken * 1e9)} for part, taken in seconds.items()},
+            "fail": {"count": sum(asked.values()), "ns": 0},  # their durations are not kept
             "cache_hit": none,
             "cache_miss": none,
         },

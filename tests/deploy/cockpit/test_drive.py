@@ -25,7 +25,7 @@ from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import over_uvicorn
-from stores import load_store
+from stores import control_of, load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -193,7 +193,7 @@ def test_a_ghost_with_a_memory_has_one_of_its_own(two_versions: Path, tmp_path: 
         source: PolicySource = BundledPolicies(tmp_path)
         if served:
             store = load_store(tmp_path)
-            port = cleanup.enter_context(over_uvicorn(create_app(lambda: store, ServerSettings())))
+            port = cleanup.enter_context(over_uvicorn(create_app(control_of(store), ServerSettings())))
             source = ServedPolicies(f"http://127.0.0.1:{port}")
         cleanup.callback(source.close)
         policy, choice = source.open(Choice("ur5", "1"), Link()), Choice("ur5", "1")
@@ -224,7 +224,7 @@ def test_a_ghost_with_a_memory_has_one_of_its_own(two_versions: Path, tmp_path: 
 
 def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(two_versions: Path, free_port: int) -> None:
     store = load_store(two_versions)
-    app = create_app(lambda: store, ServerSettings())
+    app = create_app(control_of(store), ServerSettings())
     source = ServedPolicies(f"http://127.0.0.1:{free_port}")
     with pytest.raises(UnavailableError):
         source.versions()

@@ -28,7 +28,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from stores import load_store
+from stores import control_of, load_store
 
 # In this order: each finds the drive as the one before has left it; a ghost's plot stays as long as its cycles do.
 pytestmark = [
@@ -74,7 +74,7 @@ def app(two_versions: Path) -> Any:
     """A policy server's application, made where no browser is driven."""
     with ThreadPoolExecutor(1) as elsewhere:
         store = elsewhere.submit(load_store, two_versions).result()
-    return create_app(lambda: store, ServerSettings())
+    return create_app(control_of(store), ServerSettings())
 
 
 @pytest.fixture(scope="module")

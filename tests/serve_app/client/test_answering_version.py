@@ -31,6 +31,7 @@ from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import Canary, PolicyPlan
+from stores import control_of
 
 OBS = np.linspace(-1, 1, 27).astype(np.float32)
 CLIENTS = pytest.mark.parametrize("kind", [PolicyClient, StreamClient])
@@ -72,7 +73,7 @@ def serve(served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Call
             policies = [Policy.load(folder) for folder in folders]
             server = Server(policies, PolicyStore([], {}))
             server.move("1")
-            app = create_app(lambda: server.store, ServerSettings())
+            app = create_app(control_of(lambda: server.store), ServerSettings())
             server.url = f"http://127.0.0.1:{stack.enter_context(served(app))}"
             server.handler = app.handler
             return server

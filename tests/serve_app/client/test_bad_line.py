@@ -36,7 +36,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from stores import load_store
+from stores import control_of, load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -162,7 +162,7 @@ def store(recurrent: Path, shipped: Path) -> PolicyStore:
 
 @pytest.fixture(scope="module")
 def port(store: PolicyStore, served: Serve) -> Iterator[int]:
-    with served(create_app(lambda: store, ServerSettings(api_keys=LINE))) as port:
+    with served(create_app(control_of(store), ServerSettings(api_keys=LINE))) as port:
         yield port
 
 
@@ -332,7 +332,7 @@ def test_a_memory_that_died_with_its_server_is_reported_and_not_begun_anew(
     kind: type[Client], line: FaultyLine, recurrent: Path, served: Serve, store: PolicyStore
 ) -> None:
     seen = [np.full(3, 0.1 * i, np.float32) for i in range(6)]
-    with Policy.load(recurrent / "lstm_box") as here, served(create_app(lambda: store, ServerSettings())) as other:
+    with Policy.load(recurrent / "lstm_box") as here, served(create_app(control_of(store), ServerSettings())) as other:
         expected = [here.act(obs) for obs in seen]
         with (
             connected(kind, line, "lstm_box", server_state=True) as held,

@@ -30,7 +30,7 @@ from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from stores import load_store
+from stores import control_of, load_store
 
 
 class ArmShaped(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
@@ -57,7 +57,7 @@ class Served:
 
     def __init__(self, store: PolicyStore | None) -> None:
         self.store = store
-        app = create_app(lambda: self.store, ServerSettings())
+        app = create_app(control_of(lambda: self.store), ServerSettings())
         config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws="none", lifespan="off")
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run)

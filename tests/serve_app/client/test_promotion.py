@@ -67,7 +67,7 @@ class Server:
     def restart(self) -> None:
         """Count from zero, as a new process."""
         control = self.control
-        self.app = create_app(lambda: control.store, SETTINGS, replica=self.replica, control=control)
+        self.app = create_app(control, SETTINGS, replica=self.replica)
 
     @property
     def handler(self) -> RequestHandler:

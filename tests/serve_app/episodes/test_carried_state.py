@@ -28,7 +28,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import PolicyPlan
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
-from stores import store_of
+from stores import control_of, store_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -74,7 +74,7 @@ def versions(leaky_policy: Callable[..., Path], tmp_path_factory: pytest.TempPat
 @pytest.fixture(scope="module")
 def everything(versions: dict[str, Policy], served: Serve) -> Iterator[Server]:
     held: list[Server] = []
-    app = create_app(lambda: held[0].store, ServerSettings())
+    app = create_app(control_of(lambda: held[0].store), ServerSettings())
     with served(app) as port:
         held.append(Server(f"http://127.0.0.1:{port}", app, store_of(versions["1"])))
         yield held[0]

@@ -26,7 +26,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from servers import exchange
-from stores import load_store, store_of
+from stores import control_of, load_store, store_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -42,7 +42,7 @@ def store(recurrent: Path, ur5: Path) -> PolicyStore:
 
 @pytest.fixture(scope="module")
 def port(store: PolicyStore, served: Serve) -> Iterator[int]:
-    with served(create_app(lambda: store, ServerSettings(session_idle_s=2.0))) as port:
+    with served(create_app(control_of(store), ServerSettings(session_idle_s=2.0))) as port:
         yield port
 
 
@@ -241,7 +241,7 @@ def test_an_idle_session_is_evicted_and_its_client_learns_of_it(ask: Ask) -> Non
 def test_sessions_are_bounded_in_number(store: PolicyStore, served: Serve) -> None:
     (obs,) = observations("lstm_box", 1)
     body = {"obs": plain(obs), "reset": True}
-    with served(create_app(lambda: store, ServerSettings(max_sessions=8))) as port:
+    with served(create_app(control_of(store), ServerSettings(max_sessions=8))) as port:
         ask = asking(port)
         statuses = [ask("/v1/policies/lstm_box/act", {**body, "session_id": f"many-{n}"})[0] for n in range(9)]
         assert statuses == [200] * 8 + [503]
@@ -282,7 +282,7 @@ def test_a_session_stays_with_its_version_until_that_is_gone(
     stores = [store_of(one), store_of(one, two), store_of(two)]
     now = 0
     obs = [0.5, -0.25, 1.0]
-    with served(create_app(lambda: stores[now], ServerSettings())) as port:
+    with served(create_app(control_of(lambda: stores[now]), ServerSettings())) as port:
         ask = asking(port)
 
         def step(**more: Any) -> tuple[int, Any]:
@@ -308,7 +308,7 @@ def test_an_open_stream_without_a_memory_follows_the_default(
     now = 0
     obs = np.linspace(-1, 1, 27)
     with (
-        served(create_app(lambda: stores[now], ServerSettings())) as port,
+        served(create_app(control_of(lambda: stores[now]), ServerSettings())) as port,
         StreamClient(f"http://127.0.0.1:{port}", "ur5", deadline_ms=5000) as client,
     ):
         assert client.act(obs) == pytest.approx(one.act(obs))
@@ -325,7 +325,7 @@ def test_a_stream_begins_its_next_episode_with_the_bundle_that_is_there_now(
     now = 0
     obs = observations("lstm_box", 1)[0]
     with (
-        served(create_app(lambda: stores[now], ServerSettings())) as port,
+        served(create_app(control_of(lambda: stores[now]), ServerSettings())) as port,
         Socket(port, "/v1/policies/lstm_box/stream?errors=keep") as stream,
     ):
         assert stream.ask(obs=obs)["session_step"] == 1

@@ -25,7 +25,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from storages import closing_sessions
-from stores import load_store
+from stores import control_of, load_store
 
 OBS = np.random.default_rng(3).uniform(-0.3, 0.3, (8, 3)).astype(np.float32)
 OTHER = np.float32([0.3, -0.3, 0.3])  # what a request that was given up has seen
@@ -68,7 +68,7 @@ def server(
     if getattr(request, "param", "memory") == "redis":
         settings = ServerSettings(session_store=request.getfixturevalue("redis_server").url)
     store = load_store(bundle)
-    server = Server(create_app(lambda: store, settings))
+    server = Server(create_app(control_of(store), settings))
     with served(server) as server.port:
         yield server
 

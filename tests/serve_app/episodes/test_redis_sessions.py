@@ -26,7 +26,7 @@ from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from storages import RedisServer, closing_sessions
-from stores import load_store, store_of
+from stores import control_of, load_store, store_of
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 SEEN = [np.random.default_rng(seed).uniform(-1, 1, 3).astype(np.float32) for seed in range(12)]
@@ -77,7 +77,7 @@ def serving(
     """Serve what each provider gives, by a server of its own."""
     chosen = ServerSettings(session_store=redis.url, **settings)
     with contextlib.ExitStack() as stack:
-        apps = [create_app(provider, chosen, is_alone=False) for provider in providers]
+        apps = [create_app(control_of(provider), chosen, is_alone=False) for provider in providers]
         servers = Servers(*(stack.enter_context(served(closing_sessions(app))) for app in apps))
         stack.callback(servers.close)
         yield servers
@@ -305,8 +305,8 @@ def test_our_client_keeps_a_session_over_two_servers(
 ) -> None:
     settings = ServerSettings(session_store=redis_server.url)
     with (
-        served(closing_sessions(create_app(lambda: store, settings, is_alone=False))) as port,
-        served(closing_sessions(create_app(lambda: store, settings, is_alone=False))) as other,
+        served(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as port,
+        served(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as other,
         PolicyClient(f"http://127.0.0.1:{port}", "lstm_box", server_state=True) as client,
         PolicyClient(f"http://127.0.0.1:{other}", "ur5", server_state=True) as stateless,
         Policy.load(recurrent / "lstm_box") as policy,
@@ -322,7 +322,7 @@ def test_our_client_keeps_a_session_over_two_servers(
 def test_several_processes_without_a_store_refuse_sessions_and_name_the_ways_out(
     store: PolicyStore, served: Serve
 ) -> None:
-    with served(create_app(lambda: store, ServerSettings(), is_alone=False)) as port:
+    with served(create_app(control_of(store), ServerSettings(), is_alone=False)) as port:
         servers = Servers(port)
         for status, reply in (servers.act(SEEN[0], reset=True), servers.infer(SEEN[0], 7, sequence_start=True)):
             assert (status, reply.get("code", "bad-request")) == (400, "bad-request")
@@ -335,5 +335,5 @@ def test_several_processes_without_a_store_refuse_sessions_and_name_the_ways_out
 @pytest.mark.parametrize("url", ["localhost:6379", "redis://:secret@127.0.0.1:port/0", "http://127.0.0.1"])
 def test_an_unusable_store_is_one_sentence_without_the_password(store: PolicyStore, url: str) -> None:
     with pytest.raises(UsageError, match="redis://") as caught:
-        RequestHandler(lambda: store, ServerSettings.from_environment({"session_store": url}, environment={}))
+        RequestHandler(control_of(store), ServerSettings.from_environment({"session_store": url}, environment={}))
     assert "secret" not in caught.value.message

@@ -22,7 +22,7 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
-from stores import load_store
+from stores import control_of, load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -68,7 +68,7 @@ Serve = Callable[[Any], AbstractContextManager[int]]
 
 @contextlib.contextmanager
 def serving(store: PolicyStore, served: Serve, *, idle_s: float) -> Iterator[Server]:
-    app = create_app(lambda: store, ServerSettings(max_sessions=MOST, session_idle_s=idle_s), replica="r")
+    app = create_app(control_of(store), ServerSettings(max_sessions=MOST, session_idle_s=idle_s), replica="r")
     with served(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
         yield Server(port, app, client)
 

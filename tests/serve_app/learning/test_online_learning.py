@@ -135,7 +135,7 @@ def cell(
     settings = ServerSettings(record=str(tmp_path / "recorded"), api_keys=f"{ROBOT_LINE},{ADMIN_LINE},{OTHER_LINE}")
     with (
         controlled(tmp_path / "policies") as control,
-        served(create_app(lambda: control.store, settings, control=control)) as port,
+        served(create_app(control, settings)) as port,
     ):
         yield Cell(f"http://127.0.0.1:{port}", tmp_path, checkpoint)
 

@@ -206,7 +206,7 @@ def server(request: pytest.FixtureRequest, policies: Path, controlled: Controlle
         "none": ServerSettings(),
     }[request.param]
     with controlled(policies) as control:
-        app = create_app(lambda: control.store, settings, control=control)
+        app = create_app(control, settings)
         with served(app) as port:
             yield Served(app, control, port, request.param)
 
@@ -214,7 +214,7 @@ def server(request: pytest.FixtureRequest, policies: Path, controlled: Controlle
 @pytest.fixture(scope="module")
 def app(policies: Path, controlled: Controlled) -> Iterator[PolicyApp]:
     with controlled(policies) as control:
-        yield create_app(lambda: control.store, ServerSettings(), control=control)
+        yield create_app(control, ServerSettings())
 
 
 def paths(app: PolicyApp) -> list[tuple[str, str, Access]]:
@@ -374,7 +374,7 @@ def test_no_spelling_of_a_streams_path_opens_it_without_a_key(
 ) -> None:
     with controlled(policies) as control:
         settings = ServerSettings(api_keys=ROBOT_LINE, default_policy="ur5")
-        with served(create_app(lambda: control.store, settings, control=control)) as port, Wire(port) as wire:
+        with served(create_app(control, settings)) as port, Wire(port) as wire:
             for target in spellings(path):
                 for key in ((), bearer(WRONG)):
                     status, _ = wire.ask(b"GET", target, *UPGRADE, *key, body=b"")
@@ -395,7 +395,7 @@ def test_who_administers_and_whose_key_is_refused_is_in_the_log(
     path = b"/v1/admin/policies/ur5/alias"
     with controlled(policies) as control:
         settings = ServerSettings(api_keys=f"{ROBOT_LINE},{ADMIN_LINE}")
-        with served(create_app(lambda: control.store, settings, control=control)) as port, Wire(port) as wire:
+        with served(create_app(control, settings)) as port, Wire(port) as wire:
             body = b'{"alias": "candidate", "version": "2"}'
             assert wire.ask(b"POST", path, *bearer(ADMIN), b"x-request-id: change-1", body=body)[0] == 200
             wrong = b'{"alias": "candidate", "version": "77"}'
@@ -451,7 +451,7 @@ def test_every_command_is_in_the_audit_whatever_became_of_it_and_no_key_is(
     with contextlib.ExitStack() as stack:
         stack.enter_context(listening_log(settings))
         control = stack.enter_context(controlled(policies))
-        port = stack.enter_context(served(create_app(lambda: control.store, settings, control=control)))
+        port = stack.enter_context(served(create_app(control, settings)))
         with Wire(port) as wire:
             for command, body, _ in attempts:
                 wire.ask(b"POST", b"/v1/admin/policies/ur5/" + command, *bearer(ADMIN), body=body)

@@ -34,12 +34,11 @@ from rlservo.serve_app.client.admin_client import AdminClient, find_key
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.admin_key import operator_key
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from rlservo.serve_app.wire.admin_key_file import key_file, read_key
+from rlservo.serve_app.wire.admin_key_file import key_file, read_key, written_key
 from servers import exchange
 from stores import plan_files
 
@@ -62,7 +61,7 @@ def folder(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: py
 @pytest.fixture(scope="module")
 def key_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     file = tmp_path_factory.mktemp("key") / "sub" / "admin.key"
-    with operator_key(file):
+    with written_key(file, new_key("operator", admin=True)[0]):
         yield file
 
 
@@ -74,9 +73,7 @@ def port(folder: Path, key_path: Path, served: Serve, tmp_path: Path) -> Iterato
     config = {"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}},
                            "gridworld": {"versions": ["1"]}}, "unlisted": "ignore"}  # fmt: skip
     asyncio.run(control.configure(config))
-    with served(
-        create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
-    ) as port:
+    with served(create_app(control, ServerSettings(operator_key=digest), replica="only")) as port:
         yield port
 
 
@@ -162,7 +159,7 @@ def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> It
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
     control = PlanFollower(VersionLoader(Repository([root])), plan_files(root))
     asyncio.run(control.configure({}))
-    app = create_app(lambda: control.store, ServerSettings(operator_key=digest), replica="only", control=control)
+    app = create_app(control, ServerSettings(operator_key=digest), replica="only")
     with served(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
         yield client, port, root
 
@@ -222,7 +219,7 @@ def test_administration_needs_the_key_and_acting_does_not(port: int) -> None:
 def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, served: Serve, tmp_path: Path) -> None:
     control = PlanFollower(VersionLoader(Repository([folder / "ur5" / "1"])), plan_files(tmp_path))
     asyncio.run(control.configure({}))
-    with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:
+    with served(create_app(control, ServerSettings())) as open_port:
         with (
             AdminClient(f"http://127.0.0.1:{open_port}", api_key="any") as client,
             pytest.raises(ForbiddenError, match="this server has none"),
@@ -339,10 +336,9 @@ def test_the_operators_key_is_for_this_user_alone_and_goes_with_the_server(
     file = key_file(8000)
     file.parent.mkdir(mode=0o700)
     file.symlink_to(tmp_path / "elsewhere")
-    with operator_key(file) as digest:
-        assert not file.is_symlink() and stat.S_IMODE(file.stat().st_mode) == 0o600
-        assert digest.startswith("sha256:") and find_key("http://127.0.0.1:8000", None) == read_key(file)
-        assert read_key(file) not in digest
+    with written_key(file, "abcdef") as is_written:
+        assert is_written and not file.is_symlink() and stat.S_IMODE(file.stat().st_mode) == 0o600
+        assert find_key("http://127.0.0.1:8000", None) == read_key(file) == "abcdef"
         with pytest.raises(UsageError, match="needs an admin key"):
             find_key("http://robot:8000", None)
     assert not file.exists() and not (tmp_path / "elsewhere").exists()

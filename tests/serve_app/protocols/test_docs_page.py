@@ -16,7 +16,7 @@ from browser import Browser
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.pages import FOLDER
 from rlservo.serve_app.server.settings import ServerSettings
-from stores import load_store
+from stores import control_of, load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -47,7 +47,7 @@ def test_the_document_says_that_its_paths_are_beside_it(
     policies: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
     store = load_store(policies)
-    app = create_app(lambda: store, ServerSettings())
+    app = create_app(control_of(store), ServerSettings())
     with served(BehindPrefix(app, "/robots")) as port:
         address = f"http://127.0.0.1:{port}/robots/openapi.json"
         (server,) = httpx.get(address, trust_env=False).json()["servers"]
@@ -60,7 +60,7 @@ def test_the_documentation_is_drawn_and_tried_out_without_the_internet(
     browser: Browser, policies: Path, served: Callable[[Any], AbstractContextManager[int]], prefix: str
 ) -> None:
     store = load_store(policies)
-    app = BehindPrefix(create_app(lambda: store, ServerSettings()), prefix)
+    app = BehindPrefix(create_app(control_of(store), ServerSettings()), prefix)
     with served(app) as port, browser.tab() as tab:
         tab.visit(f"http://127.0.0.1:{port}{prefix}/docs")
         drawn = tab.wait_for(  # what Swagger UI makes of /openapi.json

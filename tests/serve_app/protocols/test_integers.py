@@ -31,7 +31,7 @@ from rlservo.serve_app.runtime.observation_check import ObservationParser
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from stores import load_store
+from stores import control_of, load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -111,7 +111,7 @@ def app(tmp_path_factory: pytest.TempPathFactory) -> PolicyApp:
     for dtype in TYPES:
         write_counter(root, dtype)
     store = load_store(root)
-    return create_app(lambda: store, ServerSettings())
+    return create_app(control_of(store), ServerSettings())
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from servers import over_uvicorn
-from stores import load_store
+from stores import control_of, load_store
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
 JSON = {"content-type": "application/json"}
@@ -56,7 +56,7 @@ def loading(store: PolicyStore) -> Loading:
 
 @pytest.fixture(scope="module")
 def port(loading: Loading) -> Iterator[int]:
-    with over_uvicorn(create_app(loading, SETTINGS)) as port:
+    with over_uvicorn(create_app(control_of(loading), SETTINGS)) as port:
         yield port
 
 

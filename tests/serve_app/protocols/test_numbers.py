@@ -35,7 +35,7 @@ def port(
 ) -> Iterator[int]:
     with controlled(policies) as control:
         settings = ServerSettings(operator_key=LINE.split()[-1], default_policy="ur5")
-        with served(create_app(lambda: control.store, settings, control=control)) as port:
+        with served(create_app(control, settings)) as port:
             yield port
 
 

@@ -21,7 +21,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import PolicyPlan
 from servers import exchange
-from stores import load_store
+from stores import control_of, load_store
 
 OPTIONS = {
     "careful": PolicyOptions(max_action_step=0.1),
@@ -45,7 +45,7 @@ def store(
 
 @pytest.fixture(scope="module")
 def app(store: PolicyStore) -> Any:
-    return create_app(lambda: store, ServerSettings(max_batch=64, session_idle_s=90))
+    return create_app(control_of(store), ServerSettings(max_batch=64, session_idle_s=90))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_every_input_and_output_of_the_metadata_is_in_the_configuration(ask: Ask
 def test_an_alias_means_its_version(store: PolicyStore) -> None:
     plan = PolicyPlan(versions={"1": "", "2": "", "10": ""}, aliases={"production": "2"})
     aliased = PolicyStore([store.get("ur5", version) for version in ("1", "2", "10")], {"ur5": plan})
-    handler = create_app(lambda: aliased, ServerSettings()).handler
+    handler = create_app(control_of(aliased), ServerSettings()).handler
     assert [each["version"] for each in statistics(handler, "ur5", "production")["model_stats"]] == ["2"]
     assert [each["version"] for each in statistics(handler, "ur5")["model_stats"]] == ["1", "2", "10"]
 
@@ -175,7 +175,7 @@ class Context:
 
 def over_grpc(store: PolicyStore, method: str, **fields: str) -> Any:
     """Return the reply to a call without an action, None if it failed."""
-    handler, context = create_app(lambda: store, ServerSettings()).handler, Context()
+    handler, context = create_app(control_of(store), ServerSettings()).handler, Context()
     asked = getattr(messages, f"{method}Request")(**fields).SerializeToString()
     reply = asyncio.run(Grpc(handler).answer(method, (asked, None), context))
     return reply if context.failure is None else None

@@ -20,7 +20,7 @@ import pytest
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from stores import load_store
+from stores import control_of, load_store
 
 LENGTH = "Inference-Header-Content-Length"
 BATCH = np.random.default_rng(5).standard_normal((33, 27)).astype(np.float32)
@@ -38,7 +38,7 @@ def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pyt
 @pytest.fixture(scope="module")
 def port(store: PolicyStore, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[int]:
     settings = ServerSettings(max_body_bytes=200_000, max_batch=64, body_timeout_s=1.0)
-    with served(create_app(lambda: store, settings)) as port:
+    with served(create_app(control_of(store), settings)) as port:
         yield port
 
 
@@ -206,7 +206,7 @@ def test_over_grpc_it_is_refused_too(store: PolicyStore) -> None:
     from rlservo.serve_app.protocols.open_inference.grpc_service import OipGrpcCodec
     from rlservo.serve_app.protocols.open_inference.messages import messages
 
-    codec = OipGrpcCodec(create_app(lambda: store, ServerSettings()).handler)
+    codec = OipGrpcCodec(create_app(control_of(store), ServerSettings()).handler)
     for raw in ([b""], []):
         asked = messages.ModelInferRequest(model_name="ur5", raw_input_contents=raw)
         asked.inputs.add(name="obs", datatype="FP32", shape=[0, *[2**31 - 1] * 5])

@@ -28,7 +28,7 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import SetAlias
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from servers import over_uvicorn
-from stores import load_store
+from stores import control_of, load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 Controlled = Callable[..., AbstractContextManager[PlanFollower]]
@@ -51,7 +51,7 @@ PICTURES = os.environ.get("RLSERVO_TEST_PICTURES")
 def test_programs_get_at_the_root_what_they_always_got(policies: Path, served: Serve) -> None:
     store = load_store(policies)
     for settings, statuses in ((ServerSettings(), (404, 404)), (ServerSettings(api_keys=ROBOT_LINE), (401, 404))):
-        with served(create_app(lambda: store, settings)) as port, httpx.Client() as client:
+        with served(create_app(control_of(store), settings)) as port, httpx.Client() as client:
             for accept in ("", "*/*", "application/json", "application/json, text/html;q=0.9"):
                 headers = {"accept": accept}
                 for key, status in zip(({}, {"authorization": f"Bearer {ROBOT}"}), statuses, strict=True):
@@ -65,7 +65,7 @@ def test_programs_get_at_the_root_what_they_always_got(policies: Path, served: S
 
 def test_the_page_is_open_its_data_are_not_and_nothing_may_be_added_to_it(policies: Path, served: Serve) -> None:
     store = load_store(policies)
-    with served(create_app(lambda: store, ServerSettings(api_keys=ROBOT_LINE))) as port, httpx.Client() as client:
+    with served(create_app(control_of(store), ServerSettings(api_keys=ROBOT_LINE))) as port, httpx.Client() as client:
         url = f"http://127.0.0.1:{port}"
         page = client.get(f"{url}/", headers=PAGE)
         assert page.status_code == 200 and page.content == (FOLDER / "index.html").read_bytes()
@@ -163,7 +163,7 @@ def server(repository: Path, controlled: Controlled, served: Serve) -> Iterator[
     """A server that asks for a key only who administers it; version 1 is in use."""
     with controlled(repository, config=FIRST) as control:
         settings = ServerSettings(operator_key=OPERATOR_LINE.split()[-1])
-        with served(create_app(lambda: control.store, settings, control=control, replica="replica-a")) as port:
+        with served(create_app(control, settings, replica="replica-a")) as port:
             yield Served(port)
 
 
@@ -261,7 +261,7 @@ def test_what_a_policy_says_of_itself_is_text(
     space = observations(MARKUP, *NAMES[1:], unit="<b>rad</b>")
     describe(folder, description=f"Reaches a target. {MARKUP}", observation_space=space, detail=MARKUP)
     store = load_store(tmp_path)
-    with served(create_app(lambda: store, ServerSettings())) as port:
+    with served(create_app(control_of(store), ServerSettings())) as port:
         Served(port).act(16)
         tab.visit(f"http://127.0.0.1:{port}")
         tab.wait_for_text(f"Reaches a target. {MARKUP}", "most 0 σ: <img")
@@ -284,7 +284,7 @@ def test_several_replicas_are_summed_and_their_differences_said(
     """Behind a proxy that takes turns, each answer is another replica's."""
     with controlled(repository, config=FIRST) as one, controlled(repository, config=FIRST) as other:
         replicas = [
-            create_app(lambda control=control: control.store, ServerSettings(), control=control, replica=name)
+            create_app(control, ServerSettings(), replica=name)
             for control, name in ((one, "replica-a"), (other, "replica-b"))
         ]
         turns = itertools.cycle(replicas)
@@ -344,7 +344,7 @@ def test_with_keys_the_page_asks_for_one_and_keeps_it_nowhere(
     tab: Tab, repository: Path, controlled: Controlled, served: Serve, tmp_path: Path
 ) -> None:
     with controlled(repository) as control:
-        app = create_app(lambda: control.store, ServerSettings(api_keys=ROBOT_LINE), control=control)
+        app = create_app(control, ServerSettings(api_keys=ROBOT_LINE))
         with served(app) as port:
             server = Served(port)
             server.act(3, key=ROBOT)
@@ -417,7 +417,7 @@ def test_a_small_screen_and_a_keyboard_are_enough(tab: Tab, server: Served, tmp_
 @pytest.mark.slow
 def test_a_server_that_goes_away_is_said_and_comes_back_by_itself(tab: Tab, repository: Path, tmp_path: Path) -> None:
     store = load_store(repository)
-    app = create_app(lambda: store, ServerSettings())
+    app = create_app(control_of(store), ServerSettings())
     with over_uvicorn(app) as port:
         tab.visit(f"http://127.0.0.1:{port}")
         tab.wait_for_text("2 policies served")

@@ -156,7 +156,7 @@ def target(
     leaky_policy(tmp_path / "policies")
     _, line = new_key("operator", admin=True)
     with controlled(tmp_path / "policies") as control:
-        pages = Pages(create_app(lambda: control.store, ServerSettings(operator_key=line.split()[-1]), control=control))
+        pages = Pages(create_app(control, ServerSettings(operator_key=line.split()[-1])))
         with served(pages) as port:
             yield Target(port, pages, control)
 

@@ -25,7 +25,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
-from stores import load_store
+from stores import control_of, load_store
 
 OBS = (np.arange(27) * 0.01).astype(np.float32)
 ARRAY = b"__ndarray__"
@@ -100,7 +100,7 @@ Serve = Callable[[Any], AbstractContextManager[int]]
 @pytest.fixture(scope="module")
 def port(store: PolicyStore, served: Serve) -> Iterator[int]:
     settings = ServerSettings(max_body_bytes=100_000, max_batch=64, default_policy="ur5")
-    with served(create_app(lambda: store, settings)) as port:
+    with served(create_app(control_of(store), settings)) as port:
         yield port
 
 
@@ -254,14 +254,14 @@ def test_a_stream_that_does_not_exist_is_refused_with_404_in_our_form(port: int,
 
 
 def test_without_a_default_policy_the_root_says_where_to_connect(store: PolicyStore, served: Serve) -> None:
-    with served(create_app(lambda: store, ServerSettings())) as port:
+    with served(create_app(control_of(store), ServerSettings())) as port:
         with pytest.raises(InvalidStatus) as caught:
             OpenpiClient(port)
         assert b"no default policy among gridworld, unsafe, ur5" in (caught.value.response.body or b"")
 
 
 def test_a_server_that_is_loading_refuses_streams_with_503(served: Serve) -> None:
-    with served(create_app(lambda: None, ServerSettings())) as port:
+    with served(create_app(control_of(None), ServerSettings())) as port:
         with pytest.raises(InvalidStatus) as caught:
             OpenpiClient(port)
         assert caught.value.response.status_code == 503 and caught.value.response.headers["retry-after"] == "1"
@@ -292,7 +292,7 @@ def test_no_damaged_frame_gets_anything_but_an_answer_or_a_named_error(port: int
 def test_a_client_that_goes_while_it_is_answered_is_no_failure_of_the_server(
     store: PolicyStore, caplog: pytest.LogCaptureFixture
 ) -> None:
-    app = create_app(lambda: store, ServerSettings())
+    app = create_app(control_of(store), ServerSettings())
     frames = iter([{"type": "websocket.connect"}, {"type": "websocket.receive", "bytes": pack({"obs": OBS})}])
     sent: list[str] = []
 

@@ -26,7 +26,7 @@ from rlservo.serve_app.rollout.fallback import WithFallback
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from stores import load_store
+from stores import control_of, load_store
 
 
 class Countdown(gym.Env[Any, Any]):
@@ -64,7 +64,7 @@ def environment() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def url(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[str]:
     store = load_store(policies)
-    with served(create_app(lambda: store, ServerSettings())) as port:
+    with served(create_app(control_of(store), ServerSettings())) as port:
         yield f"http://127.0.0.1:{port}"
     store.close()
 
@@ -201,7 +201,7 @@ def test_server_gets_the_commanded_action_of_a_recorded_client(
     """The server limits the step from the last action: what comes next is at most that far from the commanded one."""
     store = load_store(policies, options={"ur5": PolicyOptions(max_action_step=0.01)})
     commanded = np.full(6, 0.9, np.float32)
-    with served(create_app(lambda: store, ServerSettings())) as port:
+    with served(create_app(control_of(store), ServerSettings())) as port:
         url = f"http://127.0.0.1:{port}"
         record = tmp_path / "run.mcap"
         with WithRecording(kind(url, "ur5"), record) if wraps else kind(url, "ur5", record=record) as policy:

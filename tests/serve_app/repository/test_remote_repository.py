@@ -34,6 +34,7 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UsageError,
 )
+from rlservo.serve_app.engines.server_process import repeat
 from rlservo.serve_app.repository.index import INDEX, Index
 from rlservo.serve_app.repository.object_storage import ObjectStorage
 from rlservo.serve_app.repository.publication import next_version, publish
@@ -438,7 +439,10 @@ def test_a_plan_in_object_storage_is_followed_raced_for_and_outlives_all(
         controls = [replica(storage.uri, cache=cache) for _ in range(3)]
         for control in controls:
             await control.configure({})
-        polls = [asyncio.create_task(control.poll_plan()) for control in controls]
+        polls = [
+            asyncio.create_task(repeat(control.files.poll_s, control.follow, "the plan cannot be followed"))
+            for control in controls
+        ]
         await controls[0].give(aliased("1"), "ur5")
         await until(lambda: all(c.store is not None and c.store.default("ur5") == "1" for c in controls))
         storage.tell(late(0.1))
@@ -761,7 +765,7 @@ def test_polling_loads_what_is_newer_and_says_once_that_the_storage_is_away(
     async def run() -> None:
         control = replica(storage.uri, cache=cache)
         await control.configure({})
-        poll = asyncio.create_task(control.poll_repository(0.05))
+        poll = asyncio.create_task(repeat(0.05, control.load_newer, "looking for new versions failed"))
         await asyncio.to_thread(put, made, storage.uri, "1", "3")
         await until(lambda: control.store is not None and control.store.versions("ur5") == ("2", "3"))  # 1 is not newer
         assert control.store is not None and control.store.default("ur5") == "2"
@@ -802,7 +806,7 @@ def test_polling_tries_again_what_could_not_be_read_for_a_while(
         await control.configure({})
         await asyncio.to_thread(put, made, storage.uri, "2")
         storage.tell(lie)
-        poll = asyncio.create_task(control.poll_repository(0.05))
+        poll = asyncio.create_task(repeat(0.05, control.load_newer, "looking for new versions failed"))
         await until(lambda: sentence in caplog.text)
         assert control.store is not None and control.store.versions("ur5") == ("1",)
         storage.tell(None)
@@ -826,7 +830,7 @@ def test_polling_leaves_out_what_the_configuration_pins(made: Path, cache: Path,
         write_box_policy(place, version="3")
         write_box_policy(place, name="new", version="1")
         write_box_policy(place, name="new", version="2")
-        poll = asyncio.create_task(control.poll_repository(0.02))
+        poll = asyncio.create_task(repeat(0.02, control.load_newer, "looking for new versions failed"))
         await asyncio.sleep(1.0)
         poll.cancel()
         assert control.store is not None

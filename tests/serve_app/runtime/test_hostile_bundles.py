@@ -38,6 +38,7 @@ from rlservo.export.contract.errors import (
 from rlservo.export.contract.regular_files import open_regular
 from rlservo.export.contract.spaces import BoxSpec
 from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.serve_app.engines.server_process import repeat
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.runtime.policy import Policy
@@ -81,7 +82,7 @@ def url(root: Path, served: Serve, patience: dict[str, float]) -> Iterator[str]:
     loader = VersionLoader(Repository([root]), **patience)
     control = PlanFollower(loader, plan_files(root))
     asyncio.run(control.configure({}))
-    app = create_app(lambda: control.store, ServerSettings(operator_key=DIGEST), replica="r", control=control)
+    app = create_app(control, ServerSettings(operator_key=DIGEST), replica="r")
     with served(app) as port:
         yield f"http://127.0.0.1:{port}"
 
@@ -402,7 +403,9 @@ def test_a_process_whose_files_hang_follows_what_others_change_meanwhile(
         for control in controls:
             await control.configure(config)
         stalled = stall(elsewhere / "ur5" / "2" / "policy.onnx")
-        watching = asyncio.create_task(controls[1].poll_plan())
+        watching = asyncio.create_task(
+            repeat(controls[1].files.poll_s, controls[1].follow, "the plan cannot be followed")
+        )
         await controls[0].give(Load(version="2"), "ur5")
         await asyncio.sleep(1.5)
         assert controls[1].behind[0].startswith("loading policy 'ur5' version 2 took longer than 1 s")

@@ -21,7 +21,7 @@ from rlservo.serve_app.runtime.observation_leaf_check import LeafParser
 from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
-from stores import load_store
+from stores import control_of, load_store
 
 ZEROS = np.zeros(27, np.float32)
 OUTSIDE = np.where(np.arange(27) == 3, np.float32(1.5), ZEROS)
@@ -142,7 +142,7 @@ def test_a_served_policy_has_its_options_and_says_what_they_did(
     options = {"ur5": PolicyOptions(out_of_bounds="clip", max_action_step=0.1), "*": PolicyOptions()}
     store = load_store(folder, options=options)
     free = bounded(out_of_bounds="accept")
-    with served(create_app(lambda: store, ServerSettings())) as port, httpx.Client() as client:
+    with served(create_app(control_of(store), ServerSettings())) as port, httpx.Client() as client:
 
         def act(**request: Any) -> Any:
             return client.post(f"http://127.0.0.1:{port}/v1/policies/ur5/act", json=request).json()

@@ -24,7 +24,7 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.addresses import is_loopback
 from servers import exchange
-from stores import load_store
+from stores import control_of, load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -70,7 +70,7 @@ def port(store: PolicyStore, served: Serve, tmp_path_factory: pytest.TempPathFac
     file = tmp_path_factory.mktemp("keys") / "keys"
     file.write_text(f"# robots\n{CELL_LINE}\n\n{ADMIN_LINE}\n{EXPLORER_LINE}\n")
     settings = ServerSettings(api_keys_file=str(file), api_keys=OTHER_LINE)
-    with served(create_app(lambda: store, settings)) as port:
+    with served(create_app(control_of(store), settings)) as port:
         yield port
 
 
@@ -164,7 +164,7 @@ def test_only_a_key_that_says_so_explores_in_every_protocol(port: int, store: Po
             assert found == status, reply
             assert status == 200 or "may not request exploring actions" in reply["error"]
         assert explores(key) is (status == 200)
-    with served(create_app(lambda: store, ServerSettings())) as open_port:  # without keys all may
+    with served(create_app(control_of(store), ServerSettings())) as open_port:  # without keys all may
         assert call(open_port, *EXPLORE)[0] == 200
 
 
@@ -178,20 +178,20 @@ def test_administration_wants_an_admin_key_even_where_no_key_is_asked_for(
 ) -> None:
     with controlled(ur5) as control:
         lines = f"{CELL_LINE},{ADMIN_LINE},{EXPLORER_LINE}"
-        with served(create_app(lambda: control.store, ServerSettings(api_keys=lines), control=control)) as port:
+        with served(create_app(control, ServerSettings(api_keys=lines))) as port:
             status, _, reply = call(port, *LOAD, authorization=f"Bearer {CELL}")
             assert (status, reply["code"]) == (403, "forbidden") and "'cell-7'" in reply["error"]
             assert call(port, *LOAD, authorization=f"Bearer {EXPLORER}")[0] == 403
             assert call(port, *LOAD)[0] == call(port, *LOAD, authorization="Bearer wrong")[0] == 401
             assert call(port, *LOAD, authorization=f"Bearer {ADMIN}")[0] in (200, 409)
-        with served(create_app(lambda: control.store, ServerSettings(), control=control)) as open_port:
+        with served(create_app(control, ServerSettings())) as open_port:
             assert call(open_port, *ACT)[0] == 200
             status, _, reply = call(open_port, *LOAD)
             assert status == 403 and "this server has none" in reply["error"]
 
 
 def test_a_web_page_of_another_origin_opens_no_stream(store: PolicyStore, served: Serve) -> None:
-    with served(create_app(lambda: store, ServerSettings())) as port:
+    with served(create_app(control_of(store), ServerSettings())) as port:
         assert stream(port, origin=f"http://127.0.0.1:{port}")["policy"] == "ur5"
         for origin in ("http://evil.example", "null", "http://["):
             with pytest.raises(InvalidStatus) as caught:

@@ -28,7 +28,7 @@ from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.server.content_bounds import ContentBounds
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
-from stores import load_store
+from stores import control_of, load_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
@@ -73,7 +73,7 @@ FRAMES = {
 @pytest.fixture(scope="module")
 def app(ur5: Path) -> PolicyApp:
     store = load_store(ur5)
-    return create_app(lambda: store, ServerSettings(max_batch=ROWS, default_policy="ur5"))
+    return create_app(control_of(store), ServerSettings(max_batch=ROWS, default_policy="ur5"))
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,8 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing
+from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import msgpack
 import pytest
@@ -21,16 +20,11 @@ import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server import current_keys
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.current_keys import CurrentKeys
-from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
-from stores import load_store
-
-Serve = Callable[[Any], AbstractContextManager[int]]
+from servers import served_in_thread
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -41,12 +35,15 @@ OBS = [0.1] * 27
 
 
 def status(port: int, key: str) -> int:
+    return ask(port, key, "POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS}))[0]
+
+
+def ask(port: int, key: str, method: str, path: str, body: str | None = None) -> tuple[int, bytes]:
     with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
         headers = {"content-type": "application/json", "authorization": f"Bearer {key}"}
-        connection.request("POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS}), headers)
+        connection.request(method, path, body, headers)
         reply = connection.getresponse()
-        reply.read()
-        return reply.status
+        return reply.status, reply.read()
 
 
 def wait_for(what: Callable[[], bool], seconds: float = 10) -> float:
@@ -65,15 +62,10 @@ def file(tmp_path: Path) -> Path:
     return file
 
 
-@pytest.fixture(scope="module")
-def store(ur5: Path) -> PolicyStore:
-    return load_store(ur5)
-
-
 @pytest.fixture
-def replicas(store: PolicyStore, served: Serve, file: Path) -> Iterator[tuple[int, int]]:
-    settings = ServerSettings(api_keys_file=str(file))
-    with served(create_app(lambda: store, settings)) as one, served(create_app(lambda: store, settings)) as two:
+def replicas(ur5: Path, file: Path) -> Iterator[tuple[int, int]]:
+    settings = {"api_keys_file": str(file)}
+    with served_in_thread([ur5], settings=settings) as one, served_in_thread([ur5], settings=settings) as two:
         yield one, two
 
 
@@ -104,7 +96,7 @@ def test_a_removed_key_stops_and_a_new_one_works_on_every_replica(
     assert took < 5  # two looks, half a second apart; the machine may be busy
 
 
-def test_a_secret_that_kubernetes_swaps_is_followed(store: PolicyStore, served: Serve, tmp_path: Path) -> None:
+def test_a_secret_that_kubernetes_swaps_is_followed(ur5: Path, tmp_path: Path) -> None:
     def publish(name: str, text: str) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "keys").write_text(text)
@@ -113,7 +105,7 @@ def test_a_secret_that_kubernetes_swaps_is_followed(store: PolicyStore, served: 
 
     publish("..one", OLD_LINE)
     (tmp_path / "keys").symlink_to("..data/keys")
-    with served(create_app(lambda: store, ServerSettings(api_keys_file=str(tmp_path / "keys")))) as port:
+    with served_in_thread([ur5], settings={"api_keys_file": str(tmp_path / "keys")}) as port:
         assert status(port, OLD) == 200
         publish("..two", NEW_LINE)
         shutil.rmtree(tmp_path / "..one")
@@ -162,15 +154,13 @@ def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
 ) -> None:
     keys = CurrentKeys(ServerSettings(api_keys_file=str(file)))
     break_by(file, how)
-    for _ in range(5):
-        keys.refresh()
+    refresh(keys, times=5)
     assert keys.accepted.find(OLD.encode()) and not keys.accepted.find(NEW.encode()) and not keys.current
     said = [record.getMessage() for record in caplog.records if record.levelno == logging.ERROR]
     assert len(said) == 1 and "the API keys were not changed" in said[0] and sentence in said[0]
     assert "secret-in-clear" not in said[0]
     restore(file)
-    for _ in range(2):
-        keys.refresh()
+    refresh(keys, times=2)
     assert keys.accepted.find(NEW.encode()) and not keys.accepted.find(OLD.encode()) and keys.current
     assert "'cell-8' added, 'cell-7' removed" in caplog.text
     with pytest.raises(UsageError, match=sentence):  # what the start refuses, for the same reason
@@ -178,53 +168,45 @@ def test_a_file_that_cannot_be_used_changes_nothing_and_is_said_once(
         Keys.from_settings(ServerSettings(api_keys_file=str(file)))
 
 
+def refresh(keys: CurrentKeys, times: int = 1) -> None:
+    for _ in range(times):
+        asyncio.run(keys.refresh())
+
+
 def test_half_a_file_is_not_used(file: Path) -> None:
     keys = CurrentKeys(ServerSettings(api_keys_file=str(file)))
     half, whole = f"{NEW_LINE}\n", f"{NEW_LINE}\n{OLD_LINE}\n"
     file.write_text(half)
-    keys.refresh()
+    refresh(keys)
     file.write_text(whole)
-    keys.refresh()
+    refresh(keys)
     assert keys.accepted.find(OLD.encode()) and not keys.accepted.find(NEW.encode())  # each was seen once
-    keys.refresh()
+    refresh(keys)
     assert keys.accepted.find(OLD.encode()) and keys.accepted.find(NEW.encode())
 
 
 def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
-    store: PolicyStore, served: Serve, file: Path, monkeypatch: pytest.MonkeyPatch
+    ur5: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hanging, go_on = threading.Event(), threading.Event()
+    go_on = threading.Event()
 
     def hang(_file: Path) -> bytes:
-        hanging.set()
         go_on.wait(30)
         return OLD_LINE.encode()
 
-    monkeypatch.setattr(current_keys, "STALE_S", 0.1)
-    app = create_app(lambda: store, ServerSettings(api_keys_file=str(file)))
-    monkeypatch.setattr(current_keys, "read_key_file", hang)
-    try:
-        with served(app) as port:
-            assert hanging.wait(10)
+    def are_current(value: bytes) -> bool:
+        return b'rlservo_api_keys_current{replica=""} %s.0\n' % value in ask(port, OLD, "GET", "/metrics")[1]
+
+    monkeypatch.setattr(current_keys, "READ_S", 0.1)
+    with served_in_thread([ur5], settings={"api_keys_file": str(file)}) as port:
+        assert are_current(b"1")
+        monkeypatch.setattr(current_keys, "read_key_file", hang)
+        try:
+            wait_for(lambda: are_current(b"0"))
             assert status(port, OLD) == 200
-            time.sleep(0.2)
-            assert b'rlservo_api_keys_current{replica=""} 0.0' in asyncio.run(exposition(app.handler))
-    finally:
-        go_on.set()
-    monkeypatch.setattr(current_keys, "STALE_S", 10.0)
-    wait_for(lambda: b'rlservo_api_keys_current{replica=""} 1.0' in asyncio.run(exposition(app.handler)))
-
-
-def test_the_watching_ends_with_the_application(file: Path) -> None:
-    def watching() -> set[threading.Thread]:
-        return {thread for thread in threading.enumerate() if thread.name == "key-file"}
-
-    before = watching()
-    keys = CurrentKeys(ServerSettings(api_keys_file=str(file)))
-    (mine,) = watching() - before
-    del keys
-    mine.join(10)
-    assert not mine.is_alive()
+        finally:
+            go_on.set()
+        wait_for(lambda: are_current(b"1"))
 
 
 @pytest.mark.parametrize("query", ["", "?errors=keep"])

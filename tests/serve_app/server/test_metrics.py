@@ -19,7 +19,7 @@ from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import Load, Unload
 from servers import exchange
-from stores import load_store
+from stores import control_of, load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -31,7 +31,7 @@ def test_requests_are_counted_by_policy_version_protocol_and_outcome(
     policies: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
     store = load_store(policies)
-    app = create_app(lambda: store, ServerSettings(default_policy="ur5"), replica="r1")
+    app = create_app(control_of(store), ServerSettings(default_policy="ur5"), replica="r1")
     with served(app) as port:
 
         def call(path: str, body: Any = None) -> tuple[int, bytes]:
@@ -95,7 +95,7 @@ def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
     for version in ("1", "2"):
         box_policy(tmp_path, version=version)
     with controlled(tmp_path, config={"policies": {"ur5": {"aliases": {"production": "1"}}}}) as control:
-        handler = RequestHandler(lambda: control.store, ServerSettings(), replica="r", control=control)
+        handler = RequestHandler(control, ServerSettings(), replica="r")
 
         def loaded() -> dict[str, float]:
             text = asyncio.run(exposition(handler)).decode()

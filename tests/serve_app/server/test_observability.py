@@ -27,7 +27,7 @@ from rlservo.serve_app.server.logs import LOGGER, configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack
 from servers import exchange
-from stores import load_store
+from stores import control_of, load_store
 
 MEAN, STD = np.linspace(-2, 2, 27), np.linspace(0.5, 3, 27)
 DASHBOARD = Path(__file__).resolve().parents[3] / "deploy" / "grafana.json"
@@ -108,7 +108,7 @@ def test_drift_of_served_requests_is_a_metric_per_element(
     filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
     store = load_store(filtered)
-    with served(create_app(lambda: store, ServerSettings(), replica="r")) as port:
+    with served(create_app(control_of(store), ServerSettings(), replica="r")) as port:
         obs = MEAN + 2 * STD * (np.arange(27) == 7)
         for _ in range(3 * EVERY):
             assert post(port, "/v1/policies/ur5/act", {"obs": obs.tolist()})[0] == 200
@@ -127,7 +127,7 @@ def test_the_log_says_what_happened_and_values_only_when_asked(
     settings = ServerSettings(log_file=str(log_file), log_requests=True, log_values=values)
     store = load_store(ur5)
     configure(settings, replica="r9")
-    with served(create_app(lambda: store, settings)) as port:
+    with served(create_app(control_of(store), settings)) as port:
         obs = [SECRET] * 27
         assert post(port, "/v1/policies/ur5/act", {"obs": obs}, x_request_id="cell-7/1")[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [f"{SECRET}"] * 27}, x_request_id='x"\\{}')[0] == 422
@@ -156,7 +156,7 @@ def test_requests_on_streams_are_logged_like_others(
     settings = ServerSettings(log_file=str(log_file), log_requests=True)
     store = load_store(ur5)
     configure(settings)
-    with served(create_app(lambda: store, settings)) as port:
+    with served(create_app(control_of(store), settings)) as port:
         address = f"ws://127.0.0.1:{port}/v1/policies/ur5"
 
         def connect(path: str) -> Any:
@@ -195,7 +195,7 @@ def test_the_dashboard_asks_for_metrics_that_exist(
     filtered: Path, tmp_path: Path, served: Callable[[Any], AbstractContextManager[int]]
 ) -> None:
     store = load_store(filtered)
-    with served(create_app(lambda: store, ServerSettings(record=str(tmp_path)), replica="r")) as port:
+    with served(create_app(control_of(store), ServerSettings(record=str(tmp_path)), replica="r")) as port:
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27})[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0]})[0] == 422
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27, "session_id": "s", "reset": True})[0] == 200

@@ -29,7 +29,7 @@ from rlservo.serve_app.server.current_keys import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from servers import exchange
-from stores import load_store
+from stores import control_of, load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -50,7 +50,7 @@ def store(ur5: Path) -> PolicyStore:
 @pytest.fixture
 def app(store: PolicyStore) -> PolicyApp:
     settings = ServerSettings(api_keys=f"{LIMITED_LINE},{FREE_LINE}", default_policy="ur5")
-    return create_app(lambda: store, settings, replica="r1")
+    return create_app(control_of(store), settings, replica="r1")
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_attempts_at_what_the_key_may_not_do_count_as_well(
 ) -> None:
     caplog.set_level("INFO", logger="rlservo")
     with controlled(policies) as control:
-        app = create_app(lambda: control.store, ServerSettings(api_keys=LIMITED_LINE), control=control)
+        app = create_app(control, ServerSettings(api_keys=LIMITED_LINE))
         with served(app) as port:
             load = ("POST", "/v1/admin/policies/ur5/load", {})
             assert [ask(port, *load)[0] for _ in range(BURST + 1)] == [403] * BURST + [429]

@@ -23,7 +23,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.request_handler import Admission
 from rlservo.serve_app.server.settings import ServerSettings
-from stores import load_store
+from stores import control_of, load_store
 
 # uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
 pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
@@ -35,7 +35,7 @@ Serve = Callable[..., AbstractContextManager[int]]
 @pytest.fixture(scope="module")
 def serve(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Serve:
     store = load_store(policies)
-    return lambda **settings: served(create_app(lambda: store, ServerSettings(**settings)))
+    return lambda **settings: served(create_app(control_of(store), ServerSettings(**settings)))
 
 
 def request(body: bytes, *, path: str = "/v1/policies/ur5/act") -> bytes:

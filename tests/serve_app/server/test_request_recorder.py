@@ -33,7 +33,7 @@ from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.request_recorder import RequestRecorder
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import exchange
-from stores import load_store
+from stores import control_of, load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -74,7 +74,7 @@ def start(recurrent: Path, ur5: Path, served: Serve, tmp_path: Path) -> Iterator
 
         def serve(options: dict[str, PolicyOptions] | None = None, **settings: Any) -> Server:
             store = load_store(recurrent, ur5, options=options)
-            app = create_app(lambda: store, ServerSettings(record=str(tmp_path / "recorded"), **settings))
+            app = create_app(control_of(store), ServerSettings(record=str(tmp_path / "recorded"), **settings))
             server = Server(stack.enter_context(served(app)), tmp_path / "recorded", app.handler.recorder, app.handler)
             stack.callback(server.recorder.close)
             return server
@@ -373,7 +373,7 @@ def test_a_folder_that_cannot_be_written_to_is_a_sentence(tmp_path: Path) -> Non
     file = tmp_path / "file"
     file.touch()
     with pytest.raises(UsageError, match="file exists: expected a new file, or a folder"):
-        create_app(lambda: None, ServerSettings(record=str(file)))
+        create_app(control_of(None), ServerSettings(record=str(file)))
 
 
 @pytest.mark.parametrize(

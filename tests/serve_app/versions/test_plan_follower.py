@@ -22,6 +22,7 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
+from rlservo.serve_app.engines.server_process import repeat
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.plan_commands import Load, Rollback, SetAlias, SetCanary, SetShadow, Unload
@@ -95,7 +96,10 @@ def test_a_change_is_served_by_who_took_it_when_it_answers_and_by_the_others_wit
         fleet = Fleet(folder, folder, folder, folder)
         await fleet.deploy(config("1", production="1"))
         first, second, third = fleet.controls
-        polls = [asyncio.create_task(control.poll_plan()) for control in (second, third)]
+        polls = [
+            asyncio.create_task(repeat(control.files.poll_s, control.follow, "the plan cannot be followed"))
+            for control in (second, third)
+        ]
         held = second.store
         await first.give(Load(version="2"), "ur5")
         plan = await first.give(aliasing("2"), "ur5")
@@ -254,7 +258,7 @@ def test_a_version_exported_since_is_not_in_use_by_itself_and_a_start_says_so(
         box_policy(folder, version="11", seed=11)
         fleet = Fleet(folder, folder)
         await fleet.deploy({})
-        poll = asyncio.create_task(fleet.controls[0].poll_plan())
+        poll = asyncio.create_task(fleet.controls[0].warn_of_newer())
         await until(lambda: "newer than the versions of plan 1, and not loaded: ur5 11" in caplog.text)
         assert fleet.defaults() == ["10"]
         poll.cancel()
@@ -432,7 +436,7 @@ def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
         fleet = Fleet(tmp_path, folder)
         await fleet.deploy(config("1", production="1"))
         (control,) = fleet.controls
-        poll = asyncio.create_task(control.poll_plan())
+        poll = asyncio.create_task(repeat(control.files.poll_s, control.follow, "the plan cannot be followed"))
         following = tmp_path / FOLDER / "000000002.json"
         following.write_text('{"generation": 2, "policies": {}, "by": "a later rlservo"}')
         await until(lambda: "000000002.json is not a plan that this rlservo can read" in caplog.text)
