@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import time
 from collections.abc import Awaitable
 from typing import Any
 
+from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
@@ -21,7 +21,6 @@ from rlservo.export.contract.errors import DeadlineError, OverloadedError, Reque
 from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, error_answer, send_reply
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
 HANDLER = "rlservo.handler"  # in the application's lifespan state, which uvicorn hands to each connection
 HEAD_S = 5.0  # [s] for a request's head, from the connection's start or the head's first byte
@@ -167,7 +166,7 @@ class BoundedHttp(HttpToolsProtocol):
 
     def _answer_to(self, error: RlservoError) -> tuple[int, bytes]:
         """Return (status, body) for a request that the application does not get; count and log it."""
-        request = Request("http", "", None, time.perf_counter(), peer=self.client and self.client[0])
+        request = Request("http", peer=self.client and self.client[0])
         self._handler.record_failure(request, error)
         return error_answer(error)[:2]
 

@@ -72,4 +72,4 @@ class GrpcServer:
     async def _answer(self, name: str, content: bytes, context: Any) -> Any:
         remaining = context.time_remaining()
         deadline = None if remaining is None or remaining > LONGEST_S else remaining
-        return await self._grpc.answer(name, (content, deadline), context)
+        return await self._grpc.answer(name, content, context, deadline)

@@ -90,7 +90,7 @@ class InferenceMethods:
 
 def _method(name: str) -> Any:
     async def answer(self: InferenceMethods, request: bytes, grpc_context: Any) -> Any:
-        return await self._grpc.answer(name, (request, None), grpc_context)
+        return await self._grpc.answer(name, request, grpc_context)
 
     return answer
 

@@ -23,6 +23,7 @@ from types import FrameType
 from typing import Any
 
 import uvicorn
+from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.supervisors import Multiprocess
 
 from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
@@ -45,7 +46,6 @@ from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.admin_key_file import written_key
-from rlservo.serve_app.wire.asgi import ASGIApp, Receive, Scope, Send
 
 logger = logging.getLogger(__name__)
 

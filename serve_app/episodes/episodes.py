@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlservo.export.contract.errors import RequestError, SessionError, SessionLostError, StateNeededError
 from rlservo.serve_app.episodes.carried_state import carry, parse_state, split_identity
-from rlservo.serve_app.episodes.memory_sessions import MemorySessions, shorten
+from rlservo.serve_app.episodes.memory_sessions import MemorySessions
 from rlservo.serve_app.episodes.request import Request, SessionId, new_episode_id
 from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.runtime.policy import Policy, Step
@@ -76,7 +76,7 @@ class Episodes:
         if episode.session_id is not None:
             request.label = str(episode.session_id)
             if store.remembers(request.policy):
-                return await self._act_in_session(store, request, episode.session_id)
+                return await self._act_in_session(store, request)
             # There is nothing to remember: the id only groups requests.
         elif episode.end or (episode.reset and request.stream_id is None):
             word = "end" if episode.end else "reset"
@@ -140,14 +140,14 @@ class Episodes:
         decision.episode = EpisodeNote(step=stream.steps)
         return decision
 
-    async def _act_in_session(self, store: PolicyStore, request: Request, session_id: SessionId) -> Decision:
+    async def _act_in_session(self, store: PolicyStore, request: Request) -> Decision:
         """Act from the state stored under the request's id."""
         if request.episode.state is not None:
             raise RequestError("the request has both 'state' and 'session_id': send one of them")
         if not self._has_sessions:
             raise RequestError(NO_SHARED_SESSIONS)
         try:
-            decision = await (self.store or self.sessions).act(store, request, session_id, self._step_session)
+            decision = await (self.store or self.sessions).act(store, request, self._step_session)
         except SessionLostError:
             self.lost[request.policy] += 1
             raise
@@ -160,14 +160,13 @@ class Episodes:
         If the last request is repeated, the session has already answered it, and is returned unchanged.
         """
         episode, seq = request.episode, request.seq
-        assert episode.session_id is not None
         if episode.reset:
             session = Session(_choose(store, request))
         else:
             if session is None:
-                raise self._lost(request, episode.session_id)
+                raise self._lost(request)
             policy = session.policy
-            _check_version(store, request, policy, f"session '{shorten(episode.session_id)}'")
+            _check_version(store, request, policy, f"session '{episode.session_id!s:.64}'")
             if session.has_answered(seq, request.obs):
                 action = policy.build_action(session.last or {}, batch=session.batch is not None)
                 contract, notices = policy.contract, tuple(session.notices)
@@ -177,7 +176,7 @@ class Episodes:
                 )  # fmt: skip
                 return decision, session
             if session.is_ended:
-                raise self._lost(request, episode.session_id)
+                raise self._lost(request)
         decision, step = _take_step(session.policy, request, before=session.state, last=session.last)
         inputs_hash = b"" if seq is None else session.policy.fingerprint(step.inputs)
         after = replace(
@@ -188,8 +187,8 @@ class Episodes:
         decision.episode = EpisodeNote(session_id=episode.session_id, step=after.steps)
         return decision, after
 
-    def _lost(self, request: Request, session_id: SessionId) -> SessionLostError:
-        shown = shorten(session_id)
+    def _lost(self, request: Request) -> SessionLostError:
+        shown = f"{request.episode.session_id!s:.64}"
         return SessionLostError(
             f"this server has no session '{shown}' of policy '{request.policy[:64]}': it was never begun, was ended, "
             f"was idle for {self._idle_s:g} s, or was lost with its process, store or version: begin an episode",

@@ -19,8 +19,6 @@ from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 StepSession: TypeAlias = Callable[[PolicyStore, Request, Session | None], tuple[Decision, Session]]
 """Computes a step: the decision, and the session after it."""
 
-Key: TypeAlias = tuple[str, SessionId]  # (policy name, session id)
-
 
 class MemorySessions:
     """The sessions of one process, by policy name and session id."""
@@ -29,37 +27,33 @@ class MemorySessions:
         """`most` bounds the episodes in memory, in sessions and on streams together (each row of a batch is one)."""
         self._most = most
         self._idle_s = idle_s
-        self._sessions: OrderedDict[Key, Session] = OrderedDict()  # the least recently used come first
+        # By policy name and session id; the least recently used come first.
+        self._sessions: OrderedDict[tuple[str, SessionId | None], Session] = OrderedDict()
         self.rows = 0  # episodes remembered, in sessions and on streams
         self.evicted: Counter[str] = Counter()  # by policy name
-
-    def __len__(self) -> int:
-        return len(self._sessions)
 
     def count(self) -> Counter[str]:
         """Return the number of sessions, by policy name."""
         self._evict()
         return Counter(name for name, _ in self._sessions)
 
-    def find(self, name: str, session_id: SessionId) -> Session | None:
+    def find(self, name: str, session_id: SessionId | None) -> Session | None:
         """Return a session that is not idle, or None."""
         self._evict()
         return self._sessions.get((name, session_id))
 
-    async def act(
-        self, store: PolicyStore, request: Request, session_id: SessionId, step_session: StepSession
-    ) -> Decision:
+    async def act(self, store: PolicyStore, request: Request, step_session: StepSession) -> Decision:
         """Decide for a request of a session. Raises UnavailableError, ClientGoneError, and what `step_session` raises.
 
         It does not wait on the last request's connection, where requests come in order anyway.
         """
-        key = (request.policy, session_id)
+        key = (request.policy, request.episode.session_id)
         before = self.find(*key)
         if before is None or request.connection is None or request.connection != before.connection:
             await check_client(request)
             before = self.find(*key)
         if before is not None and request.arrived < before.begun:
-            raise overtaken(request, session_id)
+            raise overtaken(request)
         decision, after = step_session(store, request, before)
         if after.is_ended:
             self.end(*key)
@@ -70,7 +64,7 @@ class MemorySessions:
         self._sessions.move_to_end(key)
         return decision
 
-    def end(self, name: str, session_id: SessionId) -> None:
+    def end(self, name: str, session_id: SessionId | None) -> None:
         """Forget a session."""
         session = self._sessions.pop((name, session_id), None)
         if session is not None:
@@ -105,14 +99,9 @@ class MemorySessions:
             self.evicted[name] += 1
 
 
-def overtaken(request: Request, session_id: SessionId) -> RlservoError:
+def overtaken(request: Request) -> RlservoError:
     """Return the error for a request whose session was begun again meanwhile."""
-    shown = f"session '{shorten(session_id)}' of policy '{request.policy[:64]}'"
+    shown = f"session '{request.episode.session_id!s:.64}' of policy '{request.policy[:64]}'"
     if request.episode.reset:
         return UnavailableError(f"another request started {shown} at the same time: try again")
     return SessionError(f"the request belongs to an earlier episode: another one has restarted {shown} since")
-
-
-def shorten(session_id: SessionId) -> str:
-    """Return an id in a form for error messages."""
-    return str(session_id)[:64]

@@ -27,7 +27,7 @@ from redis.exceptions import RedisError
 
 from rlservo.export.contract.errors import OverloadedError, UnavailableError, UsageError
 from rlservo.serve_app.episodes.memory_sessions import StepSession, overtaken
-from rlservo.serve_app.episodes.request import Request, SessionId, check_client, check_deadline
+from rlservo.serve_app.episodes.request import Request, check_client, check_deadline
 from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
@@ -71,11 +71,9 @@ class RedisSessions:
         self.unreachable = 0
         """Reads and writes that failed."""
 
-    async def act(
-        self, store: PolicyStore, request: Request, session_id: SessionId, step_session: StepSession
-    ) -> Decision:
-        """Decide for a request of a session, as `Sessions.act`. Also raises DeadlineError."""
-        named = json.dumps([request.policy, session_id]).encode()
+    async def act(self, store: PolicyStore, request: Request, step_session: StepSession) -> Decision:
+        """Decide for a request of a session, as `MemorySessions.act`. Also raises DeadlineError."""
+        named = json.dumps([request.policy, request.episode.session_id]).encode()
         key = "rlservo:session:" + hashlib.blake2b(named, digest_size=16).hexdigest()
         stamp, run, session = await self._load(key, store, request)
         begun = None if session is None else session.begun
@@ -86,7 +84,7 @@ class RedisSessions:
                 return decision
             stamp, run, session = await self._load(key, store, request)
             if session is not None and session.begun != begun:
-                raise overtaken(request, session_id)
+                raise overtaken(request)
 
     async def _load(self, key: str, store: PolicyStore, request: Request) -> tuple[bytes, bytes, Session | None]:
         """Return (stamp, Redis's run, session). Also raises ClientGoneError."""

@@ -72,10 +72,10 @@ class Request:
 
     protocol: str
     """Name in metrics and log."""
-    policy: str
-    version: str | None
+    policy: str = ""
+    version: str | None = None
     """A version or an alias; None is the default version."""
-    received: float
+    received: float = field(default_factory=time.perf_counter)
     """Time of arrival of its first byte, by `time.perf_counter`."""
 
     arrived: float = field(default_factory=time.perf_counter)

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import itertools
 import secrets
-import time
+from dataclasses import dataclass
 
 from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.types import Receive, Scope, Send
 
 from rlservo.export.contract.errors import (
     ForbiddenError,
@@ -19,13 +20,8 @@ from rlservo.export.contract.errors import (
     RlservoError,
     UnknownPolicyError,
 )
-from rlservo.serve_app.episodes.request import ClientGoneError, Request
-from rlservo.serve_app.protocols import (
-    admin_routes,
-    json_codec,
-    pages,
-    websocket_stream,
-)
+from rlservo.serve_app.episodes.request import ClientGoneError
+from rlservo.serve_app.protocols import admin_routes, json_codec, pages, websocket_stream
 from rlservo.serve_app.protocols.error_statuses import Headers, error_answer, missing_route, send_reply
 from rlservo.serve_app.protocols.http_endpoint import receive_body
 from rlservo.serve_app.protocols.open_inference import infer, model_info
@@ -44,7 +40,6 @@ from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
 PROCESS = secrets.token_hex(8).encode()
 numbers = itertools.count(1)
@@ -77,7 +72,7 @@ def create_app(
         *pages.routes(lambda: table),
     ]
     table = RoutingTable(routes)
-    return PolicyApp(handler, checks, table, is_behind_serve=is_behind_serve)
+    return PolicyApp(handler, table, checks, is_behind_serve)
 
 
 def _health(handler: RequestHandler) -> list[Route]:
@@ -93,17 +88,15 @@ def _health(handler: RequestHandler) -> list[Route]:
     ]
 
 
+@dataclass(frozen=True)
 class PolicyApp:
     """The ASGI application: finds each connection's route, and checks the client before it reads the body."""
 
-    def __init__(
-        self, handler: RequestHandler, checks: OriginChecks, table: RoutingTable, *, is_behind_serve: bool = False
-    ) -> None:
-        """`is_behind_serve`: Ray Serve adds the request id to replies, and its connections treat trailers as headers"""
-        self.handler = handler
-        self.table = table
-        self._checks = checks
-        self._is_behind_serve = is_behind_serve
+    handler: RequestHandler
+    table: RoutingTable
+    checks: OriginChecks
+    is_behind_serve: bool
+    """Ray Serve adds the request id to replies, and its connections treat trailers as headers."""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one ASGI connection."""
@@ -119,61 +112,55 @@ class PolicyApp:
         method = scope["method"] if scope["type"] == "http" else WEBSOCKET
         found = self.table.find(method, path, headers.get(b"accept", b""))
         audit = AuditEntry(method, path, peer_of(scope), request_id.decode("latin-1"))
-        own = () if self._is_behind_serve else ((REQUEST_ID, request_id),)
-        call = Call(scope, receive, found.params, headers, own, audit)
+        own: Headers = () if self.is_behind_serve else ((REQUEST_ID, request_id),)
+        call = Call(scope, receive, send, found.params, headers, own, audit)
         try:
-            await self._serve(found, call, send)
-        except RlservoError as error:
-            await self._refuse(call, send, error)
+            await self._admit(found, call)
+            if found.route is None:
+                status, audit.code, content, own = missing_route(method, path, found.allowed)
+            elif (reply := await found.route.answer(call)) is None:  # the end of a WebSocket
+                return
+            else:
+                status, (content, own) = 200, reply
         except ClientGoneError:
             return
+        except Exception as error:
+            audit.code = error.code if isinstance(error, RlservoError) else InternalError.code
+            if method == WEBSOCKET:
+                await websocket_stream.refuse_upgrade(call, error)
+                return
+            status, content, own = error_answer(error)
         finally:
             if found.access is Access.admin:
                 audit.write()
-
-    async def _serve(self, found: Found, call: Call, send: Send) -> None:
-        """Check the client, and answer it. Raises RlservoError if it is refused, and ClientGoneError."""
-        scope, route, path = call.scope, found.route, call.audit.path
-        check_path(scope, path)
-        self._checks.check(scope, call.headers)
-        key = authorize(self.handler.keys, presented_key(call.headers), found.access)
-        if key is not None:
-            call.audit.key = key.label
-        call.may_explore = key is None or key.may_explore
-        if self._is_behind_serve and b"transfer-encoding" in call.headers:
-            raise RequestError("a chunked body is not accepted behind Ray Serve: send Content-Length")
-        if scope["type"] == "websocket":
-            if route is None or route.stream is None:
-                raise UnknownPolicyError(f"there is no stream at {path[:200]}: connect to /v1/policies/NAME/stream")
-            await route.stream(call, send)
-            return
-        if route is None or route.answer is None:
-            status, call.audit.code, content, own = missing_route(scope["method"], path, found.allowed)
-        else:
-            if not route.reads_body:
-                call.body = bytes(await receive_body(self.handler, call.headers, call.receive))
-            try:
-                status, (content, own) = 200, await route.answer(call)
-            except ClientGoneError:
-                raise
-            except Exception as error:
-                call.audit.code = error.code if isinstance(error, RlservoError) else InternalError.code
-                status, content, own = error_answer(error)
         await send_reply(send, status, content, own + call.reply_headers)
 
-    async def _refuse(self, call: Call, send: Send, error: RlservoError) -> None:
-        """Answer a client that may not or cannot ask, and count it."""
-        audit, kind = call.audit, call.scope["type"]
-        audit.code = error.code
-        if isinstance(error, ForbiddenError | RateLimitError):
-            audit.key = audit.key or error.key
-        request = Request(kind, "", None, time.perf_counter(), request_id=audit.request_id, peer=audit.peer)
-        self.handler.record_failure(request, error)
-        if kind == "websocket":
-            await websocket_stream.refuse_upgrade(call, send, error)
-        else:
-            status, content, own = error_answer(error)
-            await send_reply(send, status, content, own + call.reply_headers)
+    async def _admit(self, found: Found, call: Call) -> None:
+        """Check the client, and read its body unless the route does.
+
+        Raises RlservoError, which has been counted, if it may not or cannot ask, and ClientGoneError.
+        """
+        scope, route, audit, path = call.scope, found.route, call.audit, call.audit.path
+        try:
+            check_path(scope, path)
+            self.checks.check(scope, call.headers)
+            key = authorize(self.handler.keys, presented_key(call.headers), found.access)
+            if key is not None:
+                audit.key = key.label
+            call.may_explore = key is None or key.may_explore
+            if self.is_behind_serve and b"transfer-encoding" in call.headers:
+                raise RequestError("a chunked body is not accepted behind Ray Serve: send Content-Length")
+            if route is None and audit.method == WEBSOCKET:
+                raise UnknownPolicyError(f"there is no stream at {path[:200]}: connect to /v1/policies/NAME/stream")
+            if route is not None and not route.reads_body:
+                call.body = bytes(await receive_body(self.handler, call.headers, call.receive))
+        except RlservoError as error:
+            if isinstance(error, ForbiddenError | RateLimitError):
+                audit.key = audit.key or error.key
+            request = call.request(scope["type"])
+            request.peer = audit.peer
+            self.handler.record_failure(request, error)
+            raise
 
 
 def route_path(scope: Scope) -> str:

@@ -7,11 +7,12 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from starlette.types import Send
+
 from rlservo.export.contract import errors
 from rlservo.export.contract.errors import ActionError, InternalError, RlservoError, TooLargeError, UnavailableError
 from rlservo.serve_app.protocols.request_fields import encode_json
 from rlservo.serve_app.server.request_handler import BUG
-from rlservo.serve_app.wire.asgi import Send
 
 logger = logging.getLogger(__name__)
 

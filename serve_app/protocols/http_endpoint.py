@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Mapping
 from functools import partial
 
+from starlette.types import Receive
+
 from rlservo.export.contract.errors import MediaTypeError
-from rlservo.serve_app.episodes.request import ClientGoneError, Request
+from rlservo.serve_app.episodes.request import ClientGoneError
 from rlservo.serve_app.protocols.error_statuses import JSON, Headers, too_large
 from rlservo.serve_app.protocols.routes import Answer, Call
-from rlservo.serve_app.server.access_checks import LABEL, header_text
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
-from rlservo.serve_app.wire.asgi import Receive
 
 HANG_UP_TURNS = 4
 OCTETS = b"application/octet-stream"
@@ -25,19 +24,10 @@ def act_over_http(protocol: str, codec: Codec[Receive, tuple[bytes, Headers]], h
     """Return the answer to a protocol's requests for actions; its name is for metrics and logs."""
 
     async def answer(call: Call) -> tuple[bytes, Headers]:
+        request = call.request(protocol, call.params["name"], call.params.get("version"))
         client = call.scope.get("client")
-        request = Request(
-            protocol,
-            call.params["name"],
-            call.params.get("version"),
-            time.perf_counter(),
-            label=header_text(call.headers, LABEL),
-            request_id=call.audit.request_id,
-            headers=call.headers,
-            connection=client if client is not None and client[1] else None,  # 0: a proxy
-            has_hung_up=partial(has_hung_up, call.receive),
-            may_explore=call.may_explore,
-        )
+        request.connection = client if client is not None and client[1] else None  # 0: a proxy
+        request.has_hung_up = partial(has_hung_up, call.receive)
         return await handler.answer(codec, request, call.receive)
 
     return answer

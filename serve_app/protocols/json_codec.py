@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import orjson
+from starlette.types import Receive
 
 from rlservo.export.contract.contract import contract_json
 from rlservo.export.contract.errors import ObservationError
@@ -23,7 +24,6 @@ from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
-from rlservo.serve_app.wire.asgi import Receive
 
 SUCH_AS = '{"obs": [...]}'
 
@@ -38,7 +38,7 @@ def routes(handler: RequestHandler) -> list[Route]:
         policy = handler.store().get(call.params["name"], call.params.get("version"))
         return contract_json(policy.contract).encode(), JSON_HEADERS
 
-    act = act_over_http("json", JsonCodec(handler), handler)
+    act = act_over_http("json", JsonCodec(), handler)
     return [
         *of_policy(POST, "/v1/policies", "/act", "Act", act, reads_body=True),
         Route(GET, "/v1/policies", Access.act, "Policies and versions served", policies),
@@ -49,23 +49,20 @@ def routes(handler: RequestHandler) -> list[Route]:
 class JsonCodec:
     """The JSON protocol's bytes (`Codec`)."""
 
-    def __init__(self, handler: RequestHandler) -> None:
-        self._handler = handler
-
-    async def receive(self, request: Request, source: Receive) -> Body:
+    async def receive(self, handler: RequestHandler, request: Request, source: Receive) -> Body:
         """Return the body. Raises MediaTypeError, and what `receive_body` raises."""
         check_media_type(request.headers)
         content_encoding(request.headers)
-        return await receive_body(self._handler, request.headers, source)
+        return await receive_body(handler, request.headers, source)
 
-    def parse(self, request: Request, content: Body) -> None:
+    def parse(self, handler: RequestHandler, request: Request, content: Body) -> None:
         """Fill the request; the policy checks the observation itself.
 
         Raises TooLargeError when the body holds more than `max_batch` observations can need, RequestError when it is
         not a JSON object of the known fields, ObservationError when it has no `obs`.
         """
         if len(content) > SMALL:
-            check_json(self._handler.store(), request.policy, content, self._handler.settings.max_batch)
+            check_json(handler.store(), request.policy, content, handler.settings.max_batch)
         document, request.non_finite = parse_json(content, such_as=SUCH_AS)
         if len(document) > 1 or "obs" not in document:  # not the usual request
             request.episode = fill_request(request, parse_fields(ACT, document))

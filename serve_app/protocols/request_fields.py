@@ -65,7 +65,6 @@ class ActRequest(Options, total=False):
 
 
 ACT: TypeAdapter[ActRequest] = TypeAdapter(ActRequest)
-REQUEST_FIELDS = ActRequest.__optional_keys__
 EXPECTED = {  # by pydantic's type of error, for clients that do not speak Python
     "bool_type": "be true or false",
     "dict_type": "be an object",

@@ -8,10 +8,13 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from starlette.types import Receive, Scope, Send
+
+from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.error_statuses import Headers
+from rlservo.serve_app.server.access_checks import LABEL, header_text
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import AuditEntry
-from rlservo.serve_app.wire.asgi import Receive, Scope, Send
 
 GET, POST = "GET", "POST"
 WEBSOCKET = "WebSocket:"  # not a method that a client can send: those have no colon
@@ -25,6 +28,7 @@ class Call:
 
     scope: Scope
     receive: Receive
+    send: Send
     params: Mapping[str, str]  # of the path
     headers: Mapping[bytes, bytes]
     reply_headers: Headers
@@ -35,11 +39,16 @@ class Call:
     body: bytes = b""
     """Read unless the route's `reads_body` says otherwise."""
 
+    def request(self, protocol: str, policy: str = "", version: str | None = None) -> Request:
+        """Return a request for an action, whose content is still to be read."""
+        label, request_id = header_text(self.headers, LABEL), self.audit.request_id
+        request = Request(protocol, policy, version, label=label, request_id=request_id, headers=self.headers)
+        request.may_explore = self.may_explore
+        return request
 
-Answer: TypeAlias = Callable[[Call], Awaitable[tuple[bytes, Headers]]]
-"""Returns the body and headers of a reply. Raises RlservoError and ClientGoneError."""
-Stream: TypeAlias = Callable[[Call, Send], Awaitable[None]]
-"""Serves a WebSocket until it closes."""
+
+Answer: TypeAlias = Callable[[Call], Awaitable[tuple[bytes, Headers] | None]]
+"""Returns the body and headers of a reply, or None after a WebSocket. Raises RlservoError and ClientGoneError."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +59,9 @@ class Route:
     path: str
     access: Access
     summary: str
-    answer: Answer | None = None
-    stream: Stream | None = None
-    """Instead of `answer`, for a WebSocket."""
+    answer: Answer
     reads_body: bool = False
-    """Whether `answer` reads the body itself, as for actions."""
+    """Whether `answer` reads the body itself, as for actions, or the messages of a WebSocket."""
     is_page: bool = False
     """Only for browsers, which accept HTML and not JSON; for other clients there is no such route."""
     is_documented: bool = True

@@ -23,10 +23,11 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from starlette.types import Message, Send
+
 from rlservo.export.contract.contract import Contract
 from rlservo.export.contract.errors import (
     InternalError,
-    OverloadedError,
     RequestError,
     RlservoError,
     TooLargeError,
@@ -40,13 +41,12 @@ from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.protocols.error_statuses import describe, error_answer, send_reply
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields
 from rlservo.serve_app.protocols.routes import WEBSOCKET, Call, Route
-from rlservo.serve_app.server.access_checks import LABEL, StreamKey, header_text, presented_key
+from rlservo.serve_app.server.access_checks import StreamKey, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_length
 from rlservo.serve_app.server.metrics import IDLE
 from rlservo.serve_app.server.request_handler import BUG, RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
-from rlservo.serve_app.wire.asgi import Message, Send
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 
 logger = logging.getLogger(__name__)
@@ -64,18 +64,9 @@ IGNORED = frozenset({"prompt", "env_id"})
 
 def routes(handler: RequestHandler) -> list[Route]:
     """Return the routes of streams."""
-    codec = MsgpackCodec(handler)
 
-    async def serve(call: Call, send: Send) -> None:
-        opening = Request(
-            PROTOCOL,
-            "",
-            None,
-            time.perf_counter(),
-            label=header_text(call.headers, LABEL),
-            request_id=call.audit.request_id,
-            headers=call.headers,
-        )
+    async def serve(call: Call) -> None:
+        opening = call.request(PROTOCOL)
         try:
             opening.policy, opening.version = _address(handler, call.params)
             opening.stream_id = new_episode_id(opening.label)
@@ -83,38 +74,22 @@ def routes(handler: RequestHandler) -> list[Route]:
             policy = handler.store().choose(opening.policy, opening.version, opening.label)
         except RlservoError as error:
             handler.record_failure(opening, error)
-            await refuse_upgrade(call, send, error)
-            return
+            raise
         await call.receive()  # websocket.connect
         try:
-            await send({"type": "websocket.accept", "headers": call.reply_headers})
-        except OSError:  # the client has already disconnected
-            return
-        try:
-            handler.open_stream(opening)
-        except OverloadedError as error:
-            await fail_stream(send, error)
-            return
-        opening.stream = Session(policy) if policy.is_stateful else None
-        stream = _Stream(handler, codec, opening, send, keeps=KEEP in call.scope.get("query_string", b"").split(b"&"))
-        try:
-            await send(_binary(encode_metadata(policy.contract)))
-            while (message := await call.receive())["type"] != "websocket.disconnect" and not stream.is_idle:
-                await send(await stream.answer(message))
+            await call.send({"type": "websocket.accept", "headers": call.reply_headers})
+            with handler.open_stream(opening):
+                opening.stream = Session(policy) if policy.is_stateful else None
+                await _Stream(handler, opening, call).run(policy.contract)
         except RlservoError as error:
-            await fail_stream(send, error)
-        except OSError:  # the client disconnected while its reply was being sent
+            await fail_stream(call.send, error)
+        except OSError:  # the client disconnected while something was being sent
             logger.debug("a stream's client disconnected before its reply could be sent")
         except Exception:
             handler.record_bug(opening)
-            await fail_stream(send, InternalError(BUG))
-        finally:
-            stream.timer.cancel()
-            if opening.stream is not None:
-                handler.episodes.sessions.reserve(opening.stream, 0)
-            handler.close_stream(opening)
+            await fail_stream(call.send, InternalError(BUG))
 
-    return [Route(WEBSOCKET, path, Access.act, "Stream of actions", stream=serve) for path in STREAM_PATHS]
+    return [Route(WEBSOCKET, path, Access.act, "Stream of actions", serve, reads_body=True) for path in STREAM_PATHS]
 
 
 def _address(handler: RequestHandler, params: Mapping[str, str]) -> tuple[str, str | None]:
@@ -135,33 +110,37 @@ def _address(handler: RequestHandler, params: Mapping[str, str]) -> tuple[str, s
 class _Stream:
     """Answers the messages of one connection in sequence, and closes it if there are none."""
 
-    def __init__(
-        self, handler: RequestHandler, codec: MsgpackCodec, opening: Request, send: Send, *, keeps: bool
-    ) -> None:
-        """`keeps`: whether the connection continues after an error."""
-        self._handler, self._codec, self._opening, self._send, self._keeps = handler, codec, opening, send, keeps
+    def __init__(self, handler: RequestHandler, opening: Request, call: Call) -> None:
+        self._handler, self._opening, self._call = handler, opening, call
+        self._keeps = KEEP in call.scope.get("query_string", b"").split(b"&")  # whether it continues after an error
         self._key = StreamKey(handler.keys, presented_key(opening.headers))
         self._timings: dict[str, float] | None = None
         self._is_fresh = False
         self._last = time.perf_counter()
-        self.is_idle = False
-        self._check()
+        self._is_silent = False
 
-    def _check(self) -> None:
-        """Close after a silence, or look again: one callback for each such period, not one for each message."""
-        left_s = self._last + self._handler.settings.stream_idle_s - time.perf_counter()
-        if left_s > 0:
-            self.timer = asyncio.get_running_loop().call_later(left_s, self._check)
-            return
-        self.is_idle = True
+    async def run(self, contract: Contract) -> None:
+        """Answer until the client disconnects. Raises RlservoError, which has been recorded, and OSError."""
+        call, silence = self._call, asyncio.create_task(self._close_when_silent())
+        try:
+            await call.send({"type": "websocket.send", "bytes": encode_metadata(contract)})
+            while (message := await call.receive())["type"] != "websocket.disconnect" and not self._is_silent:
+                await call.send(await self._answer(message))
+        finally:
+            silence.cancel()
+            if self._opening.stream is not None:
+                self._handler.episodes.sessions.reserve(self._opening.stream, 0)
+
+    async def _close_when_silent(self) -> None:
+        """Close after a silence: this wakes once in each such period, not for each message."""
+        while (left_s := self._last + self._handler.settings.stream_idle_s - time.perf_counter()) > 0:
+            await asyncio.sleep(left_s)
+        self._is_silent = True
         self._handler.record_failure(self._opening, UnavailableError(SILENT), IDLE)
-        self._closing = asyncio.create_task(self._close())  # after which the server reports a disconnect
-
-    async def _close(self) -> None:
         with contextlib.suppress(OSError, RuntimeError):  # the client may have disconnected
-            await self._send({"type": "websocket.close", "code": GOING_AWAY, "reason": SILENT})
+            await self._call.send({"type": "websocket.close", "code": GOING_AWAY, "reason": SILENT})
 
-    async def answer(self, message: Message) -> Message:
+    async def _answer(self, message: Message) -> Message:
         """Return the reply. Raises RlservoError, which has been recorded, if it ends the stream."""
         handler, opening = self._handler, self._opening
         request = Request(
@@ -179,7 +158,7 @@ class _Stream:
         self._last = request.received
         self._is_fresh = False
         try:
-            reply = await handler.answer(self._codec, request, message, self._key)
+            reply = await handler.answer(CODEC, request, message, self._key)
         except RlservoError as error:
             if not self._keeps or isinstance(error, UnauthenticatedError):
                 raise
@@ -191,61 +170,56 @@ class _Stream:
         self._timings = {"prev_total_ms": taken_s * 1e3}
         if taken_s > handler.admission.max_wait_s:
             self._is_fresh = True  # this reply blocked the loop, and the next request comes after it
-        return _binary(reply)
+        return {"type": "websocket.send", "bytes": reply}
 
 
-def _binary(content: bytes) -> Message:
-    return {"type": "websocket.send", "bytes": content}
-
-
-async def refuse_upgrade(call: Call, send: Send, error: RlservoError) -> None:
+async def refuse_upgrade(call: Call, error: Exception) -> None:
     """Answer an upgrade with an HTTP error; if the server cannot send one, accept it and send the error as a frame."""
     await call.receive()  # websocket.connect
     if DENIAL not in call.scope.get("extensions", {}):
-        await send({"type": "websocket.accept"})
-        await fail_stream(send, error)
+        await call.send({"type": "websocket.accept"})
+        await fail_stream(call.send, error)
         return
     status, content, own = error_answer(error)
-    await send_reply(send, status, content, own + call.reply_headers, kind=DENIAL)
+    await send_reply(call.send, status, content, own + call.reply_headers, kind=DENIAL)
 
 
-async def fail_stream(send: Send, error: RlservoError) -> None:
+async def fail_stream(send: Send, error: Exception) -> None:
     """End an open WebSocket with an error's body."""
-    try:
+    with contextlib.suppress(OSError, RuntimeError):  # the client may have disconnected
         await send({"type": "websocket.send", "text": error_answer(error)[1].decode()})
         await send({"type": "websocket.close", "code": FAILED, "reason": "see the text frame"})
-    except (OSError, RuntimeError):  # the client has disconnected
-        logger.debug("a stream's client disconnected before its error could be sent")
 
 
 class MsgpackCodec:
     """MessagePack of a stream (`Codec`): frame to `Request`, decision to a frame."""
 
-    def __init__(self, handler: RequestHandler) -> None:
-        self._handler = handler
-        self._max_bytes = handler.settings.max_body_bytes
-
-    async def receive(self, request: Request, source: Message) -> Mapping[Any, Any]:
+    async def receive(self, handler: RequestHandler, request: Request, source: Message) -> Mapping[Any, Any]:
         """Return the map in a frame, and note its `seq` for an error's frame. Raises RequestError."""
         content = source.get("bytes")
         if content is None:
             raise RequestError("the message is a text frame: send msgpack in a binary frame")
-        if len(content) > self._max_bytes:
-            raise TooLargeError(f"the message is larger than {self._max_bytes} bytes", {"max_bytes": self._max_bytes})
-        document = unpack(content, most=self._most_values(request, content) if len(content) > SMALL else None)
+        limit, most = handler.settings.max_body_bytes, None
+        if len(content) > limit:
+            raise TooLargeError(f"the message is larger than {limit} bytes", {"max_bytes": limit})
+        if len(content) > SMALL:
+            bounds = check_length(handler.store(), request.policy, content, handler.settings.max_batch)
+            most = max(each.values for each in bounds)
+        document = unpack(content, most=most)
         if type(document) is not dict:
             raise RequestError(f"the message must be a map such as {{'obs': ...}}, got {type(document).__name__}")
         if "obs" in document and type(document.get("seq")) is int:
             request.seq = document["seq"]
         return document
 
-    def parse(self, request: Request, content: Mapping[Any, Any]) -> None:
+    def parse(self, handler: RequestHandler, request: Request, content: Mapping[Any, Any]) -> None:
         """Fill the request. Raises RequestError."""
         if not IGNORED.isdisjoint(content):
-            content = {key: value for key, value in content.items() if key not in IGNORED or self._names(request, key)}
+            ignored = {name for name in IGNORED if not _names(handler, request, name)}
+            content = {key: value for key, value in content.items() if key not in ignored}
         if "obs" not in content:  # element names and values
             request.obs = content
-            if type(content.get("reset")) is bool and not self._names(request, "reset"):
+            if type(content.get("reset")) is bool and not _names(handler, request, "reset"):
                 request.obs = {name: value for name, value in content.items() if name != "reset"}
                 request.episode = Episode(reset=content["reset"])
         else:
@@ -260,18 +234,18 @@ class MsgpackCodec:
         fields["server_timing"] = {"infer_ms": fields.pop("infer_ms"), **(request.reply_options or {})}
         return pack(fields)
 
-    def _most_values(self, request: Request, content: bytes) -> int:
-        store, max_batch = self._handler.store(), self._handler.settings.max_batch
-        return max(bounds.values for bounds in check_length(store, request.policy, content, max_batch))
 
-    def _names(self, request: Request, name: str) -> bool:
-        """Return whether an observation of the request's policy has a part or an element of that name."""
-        stream = request.stream
-        policy = self._handler.store().get(request.policy, request.version) if stream is None else stream.policy
-        space = policy.contract.observation_space
-        if isinstance(space, DictSpec):
-            return name in space.spaces or name in space.ignored
-        return any(name == element.name for element in space.elements)
+CODEC = MsgpackCodec()
+
+
+def _names(handler: RequestHandler, request: Request, name: str) -> bool:
+    """Return whether an observation of the request's policy has a part or an element of that name."""
+    stream = request.stream
+    policy = handler.store().get(request.policy, request.version) if stream is None else stream.policy
+    space = policy.contract.observation_space
+    if isinstance(space, DictSpec):
+        return name in space.spaces or name in space.ignored
+    return any(name == element.name for element in space.elements)
 
 
 def encode_metadata(contract: Contract) -> bytes:

@@ -25,8 +25,9 @@ from rlservo.serve_app.wire.addresses import is_loopback
 from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 if TYPE_CHECKING:
+    from starlette.types import Scope
+
     from rlservo.serve_app.server.current_keys import CurrentKeys
-    from rlservo.serve_app.wire.asgi import Scope
 
 # Enough for every path of ours. Characters that need escaping, or that programs read differently, are never routed:
 # control characters, encoded and doubled slashes, dot segments, ';', '\'.

@@ -57,11 +57,11 @@ Reply = TypeVar("Reply", covariant=True)
 class Codec(Protocol[Source, Reply]):
     """Bytes of one protocol: decoded from a transport's source, and encoded for its reply."""
 
-    async def receive(self, request: Request, source: Source) -> Any:
+    async def receive(self, handler: RequestHandler, request: Request, source: Source) -> Any:
         """Return the content, read within its limits. Raises RlservoError, and ClientGoneError."""
         ...
 
-    def parse(self, request: Request, content: Any) -> None:
+    def parse(self, handler: RequestHandler, request: Request, content: Any) -> None:
         """Fill the request from its content. Raises RlservoError."""
         ...
 
@@ -133,10 +133,10 @@ class RequestHandler:
         try:
             if key is not None:
                 request.may_explore = key.check()
-            content = await codec.receive(request, source)
+            content = await codec.receive(self, request, source)
             self._admit(request)
             self.store()  # being not ready takes precedence over any fault of the request
-            codec.parse(request, content)
+            codec.parse(self, request, content)
             if request.explore and not request.may_explore:
                 raise ForbiddenError(NO_EXPLORING)
             if request.label is not None or request.episode is not NO_EPISODE:
@@ -209,17 +209,18 @@ class RequestHandler:
         name, version = ("", "") if asked is None else (request.policy, asked)
         self.metrics.count_failure(request.protocol, name, version, InternalError.code)
 
-    def open_stream(self, request: Request) -> None:
-        """Count a new stream; `request` is its opening request. Raises OverloadedError."""
+    @contextlib.contextmanager
+    def open_stream(self, request: Request) -> Iterator[None]:
+        """Count a stream while it is open; `request` is its opening request. Raises OverloadedError."""
         try:
             self.admission.open_stream(request.policy)
         except OverloadedError as error:
             self.record_failure(request, error)
             raise
-
-    def close_stream(self, request: Request) -> None:
-        """Count one stream less."""
-        self.admission.streams[request.policy] -= 1
+        try:
+            yield
+        finally:
+            self.admission.streams[request.policy] -= 1
 
     def _count_end(self, request: Request, decision: Decision, status: str) -> None:
         """Count an episode that ended, unless its requests were divided between versions at random."""

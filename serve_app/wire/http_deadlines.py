@@ -12,7 +12,6 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Iterable
 from typing import Any
 from urllib.parse import unquote, urlsplit
 from urllib.request import getproxies, proxy_bypass
@@ -32,24 +31,18 @@ TIMEOUTS = (TimeoutError, httpcore.TimeoutException)
 MOST_HELD = 65536  # [bytes] of a request, held back until it is complete
 
 
-class DeadlineBackend(httpcore.NetworkBackend):
+class DeadlineBackend(httpcore.SyncBackend):
     """Makes connections that give up at a deadline, which each thread sets for its exchange."""
 
     def __init__(self) -> None:
-        self._backend = httpcore.SyncBackend()
         self.deadline = _Deadline()
         self.connections = 0
 
     def connect_tcp(
-        self,
-        host: str,
-        port: int,
-        timeout: float | None = None,
-        local_address: str | None = None,
-        socket_options: Iterable[Any] | None = None,
+        self, host: str, port: int, timeout: float | None = None, *more: Any, **options: Any
     ) -> httpcore.NetworkStream:
         """Connect."""
-        stream = self._backend.connect_tcp(host, port, self.deadline.left(timeout), local_address, socket_options)
+        stream = super().connect_tcp(host, port, self.deadline.left(timeout), *more, **options)
         self.connections += 1
         return _DeadlineStream(stream, self.deadline)
 

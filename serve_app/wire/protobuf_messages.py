@@ -13,6 +13,7 @@ from typing import Any
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 _Field = descriptor_pb2.FieldDescriptorProto
+_DECLARATION = re.compile(r"(?:(map|repeated|oneof (\w+)) )?(\S+) (\w+)(?: = (\d+))?")
 _TYPES = {name.removeprefix("TYPE_").lower(): number for name, number in _Field.Type.items()}
 
 
@@ -20,17 +21,16 @@ def build_messages(
     package: str,
     messages: Mapping[str, Sequence[str]],
     *,
-    oneof: str = "choice",
     enums: Mapping[str, Sequence[str]] | None = None,
     services: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, Any]:
     """Return the classes of a proto3 package by name.
 
     `messages` lists each one's fields in the order of their numbers, or with explicit numbers: `int64 ns`,
-    `repeated float action`, `map float limits` (from string), `bool ready = 17`. A type is a protobuf scalar or a
-    message. A nested message is written Outer.Inner, after its outer one. `oneof` fields share their message's only
-    oneof, which is named `oneof`. `enums` lists the values' names of each enumeration, from 0. `services` lists each
-    service's methods, for reflection: `InferRequest InferResponse`, `stream InferRequest stream InferResponse`.
+    `repeated float action`, `map float limits` (from string), `bool ready = 17`, `oneof choice bool yes` (of the only
+    oneof of a message). A type is a protobuf scalar or a message. A nested message is written Outer.Inner, after its
+    outer one. `enums` lists the values' names of each enumeration, from 0. `services` lists each service's methods, for
+    reflection: `InferRequest InferResponse`, `stream InferRequest stream InferResponse`.
     """
     file = descriptor_pb2.FileDescriptorProto(name=f"rlservo/{package}.proto", package=package, syntax="proto3")
     for name, values in (enums or {}).items():
@@ -41,10 +41,7 @@ def build_messages(
         message = made[outer].nested_type.add(name=inner) if outer else file.message_type.add(name=inner)
         made[name] = message
         for position, declaration in enumerate(fields, start=1):
-            field, _, number = declaration.partition(" = ")
-            if field.startswith("oneof ") and not message.oneof_decl:
-                message.oneof_decl.add(name=oneof)
-            _add_field(message, package, name, int(number or position), field)
+            _add_field(message, package, name, position, declaration)
     for service, methods in (services or {}).items():
         described = file.service.add(name=service)
         for method, types in methods.items():
@@ -62,10 +59,9 @@ def build_messages(
     return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{package}.{name}")) for name in messages}
 
 
-def _add_field(message: Any, package: str, path: str, number: int, declaration: str) -> None:
-    kind, name = declaration.rsplit(" ", 1)
-    modifier, _, kind = kind.rpartition(" ")
-    field = message.field.add(name=name, number=number, label=_Field.LABEL_OPTIONAL)
+def _add_field(message: Any, package: str, path: str, position: int, declaration: str) -> None:
+    ((modifier, oneof, kind, name, number),) = _DECLARATION.findall(declaration)
+    field = message.field.add(name=name, number=int(number or position), label=_Field.LABEL_OPTIONAL)
     if modifier == "map":  # on the wire: a repeated message of key and value
         entry = message.nested_type.add(name="".join(part.capitalize() for part in name.split("_")) + "Entry")
         entry.options.map_entry = True
@@ -74,7 +70,9 @@ def _add_field(message: Any, package: str, path: str, number: int, declaration: 
         modifier, kind = "repeated", f"{path}.{entry.name}"
     if modifier == "repeated":
         field.label = _Field.LABEL_REPEATED
-    elif modifier == "oneof":
+    elif oneof:
+        if not message.oneof_decl:
+            message.oneof_decl.add(name=oneof)
         field.oneof_index = 0
     if kind in _TYPES:
         field.type = _TYPES[kind]

@@ -212,7 +212,7 @@ def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
     async def ask(remaining: float | None) -> list[Any]:
         context = Context()
         service = Grpc(RequestHandler(control_of(store), ServerSettings()))
-        await service.answer("ModelInfer", (asked.SerializeToString(), remaining), context)
+        await service.answer("ModelInfer", asked.SerializeToString(), context, remaining)
         return context.status
 
     assert asyncio.run(ask(0.0)) == [grpc.StatusCode.DEADLINE_EXCEEDED]

@@ -45,9 +45,6 @@ from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
 from rlservo.serve_app.wire.addresses import is_loopback
 
-Incoming = tuple[bytes, float | None]
-"""A request's bytes, and the seconds for which its caller still waits (None: indefinitely)."""
-
 PROTOCOL = "grpc"
 REQUEST_ID = "x-request-id"
 # The field of InferTensorContents that holds a datatype; FP16 has none and is sent raw.
@@ -70,18 +67,21 @@ class Grpc:
     def __init__(self, handler: RequestHandler, *, local_only: bool = False) -> None:
         """Take the handler. `local_only`: Serve binds its gRPC ports to every interface, whatever its host option."""
         self._handler = handler
-        self._codec = OipGrpcCodec(handler)
         self._local_only = local_only
 
-    async def answer(self, method: str, incoming: Incoming, context: Any) -> Any:
-        """Return the reply to one call. An error sets the status, and the empty reply is ignored."""
+    async def answer(self, method: str, content: bytes, context: Any, remaining_s: float | None = None) -> Any:
+        """Return the reply to one call. An error sets the status, and the empty reply is ignored.
+
+        The caller waits for `remaining_s`; None: indefinitely.
+        """
         try:
             request = self._begin(method, context)
+            request.deadline_ms = None if remaining_s is None else remaining_s * 1e3
             if request.request_id is not None:
                 context.set_trailing_metadata([(REQUEST_ID, request.request_id)])
             if method == "ModelInfer":
-                return await self._handler.answer(self._codec, request, incoming)
-            return self._look_up(method, incoming[0])
+                return await self._handler.answer(CODEC, request, content)
+            return self._look_up(method, content)
         except Exception as error:
             _fail(context, error)
             return messages.ServerLiveResponse()
@@ -110,31 +110,24 @@ class Grpc:
             opening = self._begin("ModelStreamInfer", context)
             opening.peer = context.peer()
             opening.label = opening.label or secrets.token_hex(8)  # one version for all when a canary runs
-            handler.open_stream(opening)
+            key = StreamKey(handler.keys, presented_key(opening.headers))
+            with handler.open_stream(opening):
+                while True:
+                    content = await asyncio.wait_for(anext(requests), idle_s)
+                    request = replace(opening, received=time.perf_counter(), arrived=time.perf_counter())
+                    try:
+                        reply = await handler.answer(CODEC, request, content, key)
+                        yield messages.ModelStreamInferResponse(infer_response=reply)
+                    except UnauthenticatedError:  # the key is no longer accepted
+                        raise
+                    except RlservoError as error:
+                        yield _error_reply(error, content)
+        except StopAsyncIteration:
+            return
+        except asyncio.TimeoutError:
+            _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
         except Exception as error:
             _fail(context, error)
-            return
-        key = StreamKey(handler.keys, presented_key(opening.headers))
-        try:
-            while True:
-                try:
-                    content = await asyncio.wait_for(anext(requests), idle_s)
-                except StopAsyncIteration:
-                    return
-                except asyncio.TimeoutError:
-                    _fail(context, DeadlineError(f"the stream was silent for {idle_s:g} s: open another one"))
-                    return
-                request = replace(opening, received=time.perf_counter(), arrived=time.perf_counter())
-                try:
-                    reply = await handler.answer(self._codec, request, (content, None), key)
-                    yield messages.ModelStreamInferResponse(infer_response=reply)
-                except UnauthenticatedError as error:  # the key is no longer accepted
-                    _fail(context, error)
-                    return
-                except RlservoError as error:
-                    yield _error_reply(error, content)
-        finally:
-            handler.close_stream(opening)
 
     def _begin(self, method: str, context: Any) -> Request:
         """Return a call's request, whose content is still to be read. Raises ForbiddenError, UnauthenticatedError."""
@@ -143,15 +136,8 @@ class Grpc:
         headers: dict[bytes, bytes] = {}
         for name, value in context.invocation_metadata():
             headers.setdefault(name.encode(), value.encode() if type(value) is str else value)
-        request = Request(
-            PROTOCOL,
-            "",
-            None,
-            time.perf_counter(),
-            label=header_text(headers, LABEL),
-            request_id=header_text(headers, REQUEST_ID.encode()),
-            headers=headers,
-        )
+        label, request_id = header_text(headers, LABEL), header_text(headers, REQUEST_ID.encode())
+        request = Request(PROTOCOL, label=label, request_id=request_id, headers=headers)
         try:
             access = model_info.METHODS[method].access if method in model_info.METHODS else Access.act
             key = authorize(self._handler.keys, presented_key(headers), access)
@@ -166,31 +152,26 @@ class Grpc:
 class OipGrpcCodec:
     """The protocol's bytes over gRPC (`Codec`)."""
 
-    def __init__(self, handler: RequestHandler) -> None:
-        self._handler = handler
-
-    async def receive(self, request: Request, source: Incoming) -> bytes:
+    async def receive(self, handler: RequestHandler, request: Request, source: bytes) -> bytes:  # noqa: ARG002
         """Return the message. Raises TooLargeError."""
-        content, remaining_s = source
-        limit = self._handler.settings.max_body_bytes
-        if len(content) > limit:
+        limit = handler.settings.max_body_bytes
+        if len(source) > limit:
             raise TooLargeError(f"the message is larger than {limit} bytes", {"max_bytes": limit})
-        request.deadline_ms = None if remaining_s is None else remaining_s * 1e3
-        return content
+        return source
 
-    def parse(self, request: Request, content: bytes) -> None:
+    def parse(self, handler: RequestHandler, request: Request, content: bytes) -> None:
         """Fill the request. Raises RequestError, ObservationError, UnknownPolicyError."""
         message = _parse(messages.ModelInferRequest, content)
         request.policy, request.version = message.model_name, message.model_version or None
-        store = self._handler.store()
+        store = handler.store()
         store.get(request.policy, request.version)
         if len(content) > SMALL:
-            check_length(store, request.policy, content, self._handler.settings.max_batch)
+            check_length(store, request.policy, content, handler.settings.max_batch)
         for field in ("inputs", "outputs", "parameters", "raw_input_contents"):
             if len(getattr(message, field)) > SPARE:
                 raise TooLargeError(f"the message has more than {SPARE} {field}")
         document, raw = _document_of(message)
-        fill(self._handler, request, document, memoryview(b"".join(raw)))
+        fill(handler, request, document, memoryview(b"".join(raw)))
         # A reply is bytes altogether or typed fields altogether, and not every type has a field.
         options: ReplyOptions = request.reply_options
         binary = bool(raw) or any(datatype_of(tensor.dtype) not in FIELDS for tensor in options.model.outputs.values())
@@ -209,6 +190,9 @@ class OipGrpcCodec:
             if "data" in tensor:
                 getattr(output.contents, FIELDS[tensor["datatype"]]).extend(tensor["data"].tolist())
         return reply
+
+
+CODEC = OipGrpcCodec()
 
 
 def _document_of(message: Any) -> tuple[dict[str, Any], Sequence[bytes]]:

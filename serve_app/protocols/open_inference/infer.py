@@ -21,6 +21,7 @@ from weakref import WeakKeyDictionary
 import orjson
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, SkipValidation, TypeAdapter, with_config
+from starlette.types import Receive
 from typing_extensions import Required, TypedDict
 
 from rlservo.export.contract.contract import REWARD
@@ -43,7 +44,6 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.versions.policy_store import Decision
-from rlservo.serve_app.wire.asgi import Receive
 from rlservo.serve_app.wire.request_names import BELONGS_TO
 
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
@@ -114,7 +114,7 @@ PARAMETERS: TypeAdapter[Parameters] = TypeAdapter(Parameters)
 
 def routes(handler: RequestHandler) -> list[Route]:
     """Return the routes of /v2 for actions."""
-    infer = act_over_http("oip", OipHttpCodec(handler), handler)
+    infer = act_over_http("oip", OipHttpCodec(), handler)
     return of_policy(POST, "/v2/models", "/infer", "Infer", infer, reads_body=True)
 
 
@@ -170,33 +170,30 @@ class ReplyOptions:
 class OipHttpCodec:
     """The protocol's bytes over HTTP (`Codec`): JSON and raw tensors in, JSON and raw tensors out."""
 
-    def __init__(self, handler: RequestHandler) -> None:
-        self._handler = handler
-
-    async def receive(self, request: Request, source: Receive) -> Body:
+    async def receive(self, handler: RequestHandler, request: Request, source: Receive) -> Body:
         """Return the body, still compressed. Raises MediaTypeError, and what `receive_body` raises.
 
         Triton's client sends no content type, others send JSON or octets: the length header distinguishes them.
         """
         check_media_type(request.headers, OCTETS, optional=True)
         content_encoding(request.headers, *ENCODINGS)
-        return await receive_body(self._handler, request.headers, source)
+        return await receive_body(handler, request.headers, source)
 
-    def parse(self, request: Request, content: Body) -> None:
+    def parse(self, handler: RequestHandler, request: Request, content: Body) -> None:
         """Fill the request. Raises RequestError, ObservationError, TooLargeError, UnknownPolicyError."""
-        self._handler.store().get(request.policy, request.version)  # an unknown one is reported first
+        handler.store().get(request.policy, request.version)  # an unknown one is reported first
         length = _parse_length(request.headers.get(LENGTH_HEADER))
         encoding = content_encoding(request.headers, *ENCODINGS)
         if encoding:
-            content = _decompress(content, encoding, self._handler.settings.max_body_bytes)
+            content = _decompress(content, encoding, handler.settings.max_body_bytes)
         view = memoryview(content)
         if length is not None and length > len(view):
             raise RequestError(f"Inference-Header-Content-Length is {length}, but the body has {len(view)} bytes")
         header, raw = (view, view[:0]) if length is None else (view[:length], view[length:])
         if len(view) > SMALL:
-            check_json(self._handler.store(), request.policy, header, self._handler.settings.max_batch)
+            check_json(handler.store(), request.policy, header, handler.settings.max_batch)
         document, request.non_finite = parse_json(header, such_as=SUCH_AS)
-        fill(self._handler, request, document, raw)
+        fill(handler, request, document, raw)
 
     def encode(self, request: Request, decision: Decision) -> tuple[bytes, Headers]:
         """Return the reply's body and headers."""

@@ -36,11 +36,11 @@ _MESSAGES: dict[str, list[str]] = {
     ],
     "ModelMetadataResponse.TensorMetadata": _TENSOR,
     "InferParameter": [
-        "oneof bool bool_param",
-        "oneof int64 int64_param",
-        "oneof string string_param",
-        "oneof double double_param",
-        "oneof uint64 uint64_param",
+        "oneof parameter_choice bool bool_param",
+        "oneof parameter_choice int64 int64_param",
+        "oneof parameter_choice string string_param",
+        "oneof parameter_choice double double_param",
+        "oneof parameter_choice uint64 uint64_param",
     ],
     "InferTensorContents": [
         "repeated bool bool_contents",
@@ -132,7 +132,6 @@ messages: Any = SimpleNamespace(
     **build_messages(
         PACKAGE,
         _MESSAGES,
-        oneof="parameter_choice",
         enums={"DataType": [f"TYPE_{name}" for name in ("INVALID", *DTYPES)]},
         services={"GRPCInferenceService": _METHODS},
     )

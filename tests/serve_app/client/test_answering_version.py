@@ -154,7 +154,7 @@ def test_canary_gets_its_share_of_recurrent_episodes(recurrents: Server, server_
             client.outcome(1.0, terminated=True, final_obs=obs)
             chosen.append(first)
     assert 10 <= chosen.count("2") <= 50
-    assert recurrents.handler is not None and len(recurrents.handler.episodes.sessions) == 0
+    assert recurrents.handler is not None and not recurrents.handler.episodes.sessions.count()
     ends = recurrents.ends("lstm_box")
     assert [sum(ends[version]) for version in "12"] == [chosen.count("1"), chosen.count("2")]
 

@@ -203,7 +203,7 @@ def test_so_does_grpc(server: Server, versions: dict[str, Policy]) -> None:
         context = Call()
 
         async def answer() -> Any:
-            return await grpc.answer("ModelInfer", (request.SerializeToString(), None), context)
+            return await grpc.answer("ModelInfer", request.SerializeToString(), context)
 
         return asyncio.run(answer()), context
 

@@ -138,7 +138,7 @@ def test_the_id_of_a_policy_that_remembers_nothing_is_a_label(server: Server) ->
     for number in range(3 * MOST):
         status, reply = server.act(f"label-{number}", policy="ur5", reset=True)
         assert status == 200 and "session_step" not in reply
-    assert len(server.sessions) == 0
+    assert not server.sessions.count()
     with PolicyClient(f"http://127.0.0.1:{server.port}", "ur5", server_state=True) as client:
         for _ in range(2):
             client.act(np.zeros(27))

@@ -208,7 +208,7 @@ def over_grpc(app: PolicyApp, policy: str, datatype: str, array: Any, *, raw: bo
     else:
         getattr(given.contents, FIELDS[datatype]).extend(array.tolist())
     request = Request("grpc", "", None, time.perf_counter())
-    return asyncio.run(handler.answer(OipGrpcCodec(handler), request, (asked.SerializeToString(), None)))
+    return asyncio.run(handler.answer(OipGrpcCodec(), request, asked.SerializeToString()))
 
 
 def test_typed_contents_of_64_bits_are_kept_exactly(app: PolicyApp) -> None:

@@ -177,7 +177,7 @@ def over_grpc(store: PolicyStore, method: str, **fields: str) -> Any:
     """Return the reply to a call without an action, None if it failed."""
     handler, context = create_app(control_of(store), ServerSettings()).handler, Context()
     asked = getattr(messages, f"{method}Request")(**fields).SerializeToString()
-    reply = asyncio.run(Grpc(handler).answer(method, (asked, None), context))
+    reply = asyncio.run(Grpc(handler).answer(method, asked, context))
     return reply if context.failure is None else None
 
 

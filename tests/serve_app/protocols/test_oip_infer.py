@@ -206,12 +206,12 @@ def test_over_grpc_it_is_refused_too(store: PolicyStore) -> None:
     from rlservo.serve_app.protocols.open_inference.grpc_service import OipGrpcCodec
     from rlservo.serve_app.protocols.open_inference.messages import messages
 
-    codec = OipGrpcCodec(create_app(control_of(store), ServerSettings()).handler)
+    handler = create_app(control_of(store), ServerSettings()).handler
     for raw in ([b""], []):
         asked = messages.ModelInferRequest(model_name="ur5", raw_input_contents=raw)
         asked.inputs.add(name="obs", datatype="FP32", shape=[0, *[2**31 - 1] * 5])
         with pytest.raises(RequestError, match="'shape' must be"):
-            codec.parse(Request("grpc", "", None, 0.0), asked.SerializeToString())
+            OipGrpcCodec().parse(handler, Request("grpc"), asked.SerializeToString())
 
 
 def test_a_body_that_unpacks_to_too_much_is_refused(ask: Ask) -> None:

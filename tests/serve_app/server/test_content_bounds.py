@@ -110,7 +110,7 @@ def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: PolicyApp) ->
         request = Request("grpc", "", None, time.perf_counter())
         handler = app.handler
         with pytest.raises(TooLargeError):
-            asyncio.run(handler.answer(OipGrpcCodec(handler), request, (message.SerializeToString(), None)))
+            asyncio.run(handler.answer(OipGrpcCodec(), request, message.SerializeToString()))
 
 
 IMAGE = BoxSpec(shape=(20, 20, 4), dtype="uint8", low=0, high=255)

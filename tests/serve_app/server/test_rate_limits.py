@@ -192,7 +192,7 @@ def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
         service, contexts = Grpc(app.handler), []
         for _ in range(BURST + 1):
             contexts.append(Context(LIMITED))
-            await service.answer("ModelInfer", (infer(), None), contexts[-1])
+            await service.answer("ModelInfer", infer(), contexts[-1])
         return contexts
 
     *good, refused = asyncio.run(calls())
@@ -224,7 +224,7 @@ def test_grpc_refuses_exploring_to_a_key_for_actions_alone(app: PolicyApp) -> No
 
     async def calls() -> tuple[Context, list[str]]:
         service, context = Grpc(app.handler), Context(FREE)
-        await service.answer("ModelInfer", (infer(explore=True), None), context)
+        await service.answer("ModelInfer", infer(explore=True), context)
         return context, [reply.error_message async for reply in service.stream(requests(), Context(FREE))]
 
     refused, streamed = asyncio.run(calls())

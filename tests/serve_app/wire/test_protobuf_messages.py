@@ -12,10 +12,14 @@ def test_every_kind_of_field_has_its_number_and_type_on_the_wire() -> None:
     built = build_messages(
         "a.b",
         {
-            "Outer": ["repeated float values", "map Outer.Inner by_name", "oneof bool yes", "oneof string text = 17"],
+            "Outer": [
+                "repeated float values",
+                "map Outer.Inner by_name",
+                "oneof either bool yes",
+                "oneof either string text = 17",
+            ],
             "Outer.Inner": ["int64 count"],
         },
-        oneof="either",
     )
     message = built["Outer"](values=[1.0, -2.0], by_name={"x": built["Outer.Inner"](count=3)}, text="t")
     # tag = number << 3 | wire type: 0 varint, 2 length and content
