@@ -37,9 +37,8 @@ NODE_GROUP = "RAY_NODE_TYPE_NAME"  # what an autoscaler sets for the nodes it st
 
 def main(folder: Path) -> None:
     results: dict[str, Any] = {}
-    Path(tempfile.gettempdir(), "ray").mkdir(
-        exist_ok=True
-    )  # Cluster writes its address there, whatever its own folder (ray 2.60)
+    # Cluster writes its address there, whatever its own folder (ray 2.60).
+    Path(tempfile.gettempdir(), "ray").mkdir(exist_ok=True)
     temporary = tempfile.mkdtemp(prefix="grow-", dir="/tmp")
     cluster = Cluster(
         initialize_head=True, head_node_args={"num_cpus": 2, "temp_dir": temporary, "include_dashboard": False}
