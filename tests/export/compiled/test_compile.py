@@ -43,7 +43,7 @@ def test_the_proof_and_its_figures_stand_in_compile_json(compiled_ur5: Compiled)
     assert 0 <= about["proof"]["rounding_used"] < 100 and 0 <= about["proof"]["rounding_most"] < 10
     times = about["proof"]["step_us"]
     assert 0 < times["median"] <= times["longest"] and 0 < times["slowest_observation"] <= times["longest"]
-    assert 0 < about["proof"]["stack_bytes"] < 1000
+    assert 0 < about["proof"]["stack_bytes"] < 4096  # under -march=native: more where vectors have 64 bytes
     assert about["proof"]["code_bytes"] < 400_000  # weights and all
     assert set(SOURCES) < set(about["files"])
 
