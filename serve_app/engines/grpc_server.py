@@ -12,7 +12,7 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from rlservo.export.contract.errors import UnavailableError
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
-from rlservo.serve_app.protocols.open_inference.messages import SERVICE, STREAM, UNARY, messages
+from rlservo.serve_app.protocols.open_inference.messages import SERVICE, STREAM, UNARY
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.wire.addresses import is_loopback
 
@@ -48,11 +48,6 @@ class GrpcServer:
         service: Any = health  # its asyncio part is not in its type stubs
         self._health = service.aio.HealthServicer()  # probed by orchestrators, without a key
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        if settings.grpc_reflection:  # grpcurl and others ask which methods and messages the protocol has
-            from grpc_reflection.v1alpha import reflection
-
-            pool = messages.ModelInferRequest.DESCRIPTOR.file.pool
-            reflection.enable_server_reflection((SERVICE, reflection.SERVICE_NAME), self._server, pool=pool)
 
     async def start(self) -> None:
         """Listen, and report the health status "serving". Raises UnavailableError if it cannot listen on the port."""

@@ -61,9 +61,6 @@ class ServerSettings(BaseModel):
     """Addresses, separated by commas, of proxies in front of the embedded server whose `X-Forwarded-For` names the
     client, for the log and the bound above; none by default."""
 
-    grpc_reflection: bool = False
-    """Answer gRPC's reflection service, with which grpcurl and others find methods and messages (embedded server)."""
-
     stream_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A stream (WebSocket, gRPC) that was silent for this long is closed."""
 

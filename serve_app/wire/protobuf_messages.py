@@ -22,15 +22,13 @@ def build_messages(
     messages: Mapping[str, Sequence[str]],
     *,
     enums: Mapping[str, Sequence[str]] | None = None,
-    services: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, Any]:
     """Return the classes of a proto3 package by name.
 
     `messages` lists each one's fields in the order of their numbers, or with explicit numbers: `int64 ns`,
     `repeated float action`, `map float limits` (from string), `bool ready = 17`, `oneof choice bool yes` (of the only
     oneof of a message). A type is a protobuf scalar or a message. A nested message is written Outer.Inner, after its
-    outer one. `enums` lists the values' names of each enumeration, from 0. `services` lists each service's methods, for
-    reflection: `InferRequest InferResponse`, `stream InferRequest stream InferResponse`.
+    outer one. `enums` lists the values' names of each enumeration, from 0.
     """
     file = descriptor_pb2.FileDescriptorProto(name=f"rlservo/{package}.proto", package=package, syntax="proto3")
     for name, values in (enums or {}).items():
@@ -42,17 +40,6 @@ def build_messages(
         made[name] = message
         for position, declaration in enumerate(fields, start=1):
             _add_field(message, package, name, position, declaration)
-    for service, methods in (services or {}).items():
-        described = file.service.add(name=service)
-        for method, types in methods.items():
-            given, made_of = re.findall(r"(stream )?(\S+)", types)
-            described.method.add(
-                name=method,
-                input_type=f".{package}.{given[1]}",
-                output_type=f".{package}.{made_of[1]}",
-                client_streaming=bool(given[0]),
-                server_streaming=bool(made_of[0]),
-            )
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
     # Classes made at run time have no static type, hence Any.

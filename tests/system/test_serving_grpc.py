@@ -288,18 +288,14 @@ def test_messages_leave_the_process_wide_pool_alone() -> None:
     assert done.stdout.strip() == "free", done.stderr
 
 
-def test_health_is_told_without_a_key_and_reflection_where_it_is_wanted(policies: Path) -> None:
+def test_health_is_told_without_a_key(policies: Path) -> None:
     from grpc_health.v1 import health_pb2, health_pb2_grpc
-    from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-    with launched(policies, with_grpc=True, settings={"grpc_reflection": True}) as run:
+    with launched(policies, with_grpc=True) as run:
         run.wait_until_ready()
         with grpc.insecure_channel(f"127.0.0.1:{run.grpc_port}") as channel:
             for service in ("", "inference.GRPCInferenceService"):
                 request = health_pb2.HealthCheckRequest(service=service)
                 reply = health_pb2_grpc.HealthStub(channel).Check(request, timeout=20)
                 assert reply.status == health_pb2.HealthCheckResponse.SERVING
-            ask = reflection_pb2.ServerReflectionRequest(file_containing_symbol="inference.GRPCInferenceService")
-            (found,) = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo(iter([ask]))
-            assert b"ModelStreamInfer" in found.file_descriptor_response.file_descriptor_proto[0]
         assert run.end(signal.SIGTERM) == 0

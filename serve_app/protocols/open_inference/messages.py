@@ -125,15 +125,7 @@ _MESSAGES: dict[str, list[str]] = {
 
 UNARY = tuple(name.removesuffix("Request") for name in _MESSAGES if name.endswith("Request"))
 STREAM = "ModelStreamInfer"
-_METHODS = {name: f"{name}Request {name}Response" for name in UNARY}
-_METHODS[STREAM] = "stream ModelInferRequest stream ModelStreamInferResponse"
 
-messages: Any = SimpleNamespace(
-    **build_messages(
-        PACKAGE,
-        _MESSAGES,
-        enums={"DataType": [f"TYPE_{name}" for name in ("INVALID", *DTYPES)]},
-        services={"GRPCInferenceService": _METHODS},
-    )
-)
+_DATATYPES = {"DataType": [f"TYPE_{name}" for name in ("INVALID", *DTYPES)]}
+messages: Any = SimpleNamespace(**build_messages(PACKAGE, _MESSAGES, enums=_DATATYPES))
 """The classes by name; made at run time, they have no static type. A nested class is an attribute of its outer one."""
