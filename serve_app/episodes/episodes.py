@@ -18,7 +18,7 @@ from rlservo.serve_app.episodes.memory_sessions import MemorySessions
 from rlservo.serve_app.episodes.request import Request, SessionId, new_episode_id
 from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.runtime.policy import Policy, Step
-from rlservo.serve_app.versions.policy_store import Decision, EpisodeNote, EpisodeStep, PolicyStore, take_step
+from rlservo.serve_app.versions.policy_store import Decision, EpisodeStep, PolicyStore, take_step
 from rlservo.serve_app.wire.request_names import BELONGS_TO
 
 if TYPE_CHECKING:
@@ -67,22 +67,21 @@ class Episodes:
         SessionLostError, RequestError, UnavailableError if there is no room or the store cannot be reached, and what
         `Policy.step` raises; the recurrent state has then not changed.
         """
-        episode = request.episode
-        if episode.final_status is not None and episode.begins:
+        if request.final_status is not None and request.begins:
             raise RequestError(
                 "'final_status' ends an episode, and this request begins one ('reset', or an empty 'state'): "
                 "report how the last one ended in a separate request before it"
             )
-        if episode.session_id is not None:
-            request.label = str(episode.session_id)
+        if request.session_id is not None:
+            request.label = str(request.session_id)
             if store.remembers(request.policy):
                 return await self._act_in_session(store, request)
             # There is nothing to remember: the id only groups requests.
-        elif episode.end or (episode.reset and request.stream_id is None):
-            word = "end" if episode.end else "reset"
+        elif request.end or (request.reset and request.stream_id is None):
+            word = "end" if request.end else "reset"
             raise RequestError(f"'{word}' needs a session: also send its 'session_id'")
-        if episode.state is not None:
-            return self._act_from_carried(store, request, episode.state)
+        if request.state is not None:
+            return self._act_from_carried(store, request, request.state)
         if request.stream is not None:
             return self._act_on_stream(store, request, request.stream)
         return _act_alone(store, request)
@@ -123,26 +122,25 @@ class Episodes:
             if self.marks_states:  # one without a mark is unknown, but not an episode's first
                 mark = carried.mark or EpisodeStep(new_episode_id(request.label), 1 if state else 0)
                 next_mark = EpisodeStep(mark.episode, mark.step + 1)
-            decision.episode = EpisodeNote(state=carry(policy, step, next_mark), recorded_step=mark)
+            decision.state, decision.recorded_step = carry(policy, step, next_mark), mark
         return decision
 
     def _act_on_stream(self, store: PolicyStore, request: Request, stream: Session) -> Decision:
         """Act from the state that the connection keeps."""
         before = stream
-        if request.episode.reset:
+        if request.reset:
             before = Session(_choose(store, request))
         else:
             _check_version(store, request, stream.policy, "this stream's episode")
         decision, step = _take_step(before.policy, request, before=before.state, last=before.last)
         self.sessions.reserve(stream, step.rows if before.policy.is_stateful else 0)
         stream.policy, stream.state, stream.last = before.policy, step.state or None, step.leaves
-        stream.steps = before.steps + 1
-        decision.episode = EpisodeNote(step=stream.steps)
+        decision.session_step = stream.steps = before.steps + 1
         return decision
 
     async def _act_in_session(self, store: PolicyStore, request: Request) -> Decision:
         """Act from the state stored under the request's id."""
-        if request.episode.state is not None:
+        if request.state is not None:
             raise RequestError("the request has both 'state' and 'session_id': send one of them")
         if not self._has_sessions:
             raise RequestError(NO_SHARED_SESSIONS)
@@ -151,7 +149,7 @@ class Episodes:
         except SessionLostError:
             self.lost[request.policy] += 1
             raise
-        self.begun[request.policy] += request.episode.reset
+        self.begun[request.policy] += request.reset
         return decision
 
     def _step_session(self, store: PolicyStore, request: Request, session: Session | None) -> tuple[Decision, Session]:
@@ -159,36 +157,35 @@ class Episodes:
 
         If the last request is repeated, the session has already answered it, and is returned unchanged.
         """
-        episode, seq = request.episode, request.seq
-        if episode.reset:
+        if request.reset:
             session = Session(_choose(store, request))
         else:
             if session is None:
                 raise self._lost(request)
             policy = session.policy
-            _check_version(store, request, policy, f"session '{episode.session_id!s:.64}'")
-            if session.has_answered(seq, request.obs):
+            _check_version(store, request, policy, f"session '{request.session_id!s:.64}'")
+            if session.has_answered(request.seq, request.obs):
                 action = policy.build_action(session.last or {}, batch=session.batch is not None)
                 contract, notices = policy.contract, tuple(session.notices)
                 decision = Decision(
                     action, policy, {}, contract.name, contract.version, session.infer_ms, session.batch, notices,
-                    EpisodeNote(session_id=episode.session_id, step=session.steps), is_repeat=True,
+                    session_id=request.session_id, session_step=session.steps, is_repeat=True,
                 )  # fmt: skip
                 return decision, session
             if session.is_ended:
                 raise self._lost(request)
         decision, step = _take_step(session.policy, request, before=session.state, last=session.last)
-        inputs_hash = b"" if seq is None else session.policy.fingerprint(step.inputs)
+        inputs_hash = b"" if request.seq is None else session.policy.fingerprint(step.inputs)
         after = replace(
             session, state=step.state or None, last=step.leaves, steps=session.steps + 1, rows=step.rows,
-            is_ended=episode.end, seq=seq, inputs_hash=inputs_hash, infer_ms=decision.infer_ms, batch=decision.batch,
-            notices=decision.notices,
+            is_ended=request.end, seq=request.seq, inputs_hash=inputs_hash, infer_ms=decision.infer_ms,
+            batch=decision.batch, notices=decision.notices,
         )  # fmt: skip
-        decision.episode = EpisodeNote(session_id=episode.session_id, step=after.steps)
+        decision.session_id, decision.session_step = request.session_id, after.steps
         return decision, after
 
     def _lost(self, request: Request) -> SessionLostError:
-        shown = f"{request.episode.session_id!s:.64}"
+        shown = f"{request.session_id!s:.64}"
         return SessionLostError(
             f"this server has no session '{shown}' of policy '{request.policy[:64]}': it was never begun, was ended, "
             f"was idle for {self._idle_s:g} s, or was lost with its process, store or version: begin an episode",
@@ -212,7 +209,7 @@ def _choose(store: PolicyStore, request: Request) -> Policy:
 
 def _check_last_action(policy: Policy, request: Request, last_action: Any) -> None:
     """Raise StateNeededError if a limited step has no last action to count from."""
-    if policy.has_step_limit and last_action is None and request.episode.last_action is None:
+    if policy.has_step_limit and last_action is None and request.last_action is None:
         raise StateNeededError(f"policy '{request.policy}' {NEEDS_LAST}")
 
 
@@ -244,12 +241,11 @@ def _check_version(store: PolicyStore, request: Request, policy: Policy, memory:
 
 def _take_step(policy: Policy, request: Request, *, last_action: Any = None, **memory: Any) -> tuple[Decision, Step]:
     """Take a step from `memory`, as `Policy.step` takes it; a last action in the request precedes `last_action`."""
-    episode = request.episode
     return take_step(
         policy,
         request.obs,
-        last_action=last_action if episode.last_action is None else episode.last_action,
-        reward=episode.reward,
+        last_action=last_action if request.last_action is None else request.last_action,
+        reward=request.reward,
         explore=request.explore,
         seed=request.seed,
         **memory,

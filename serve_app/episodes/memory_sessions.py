@@ -47,7 +47,7 @@ class MemorySessions:
 
         It does not wait on the last request's connection, where requests come in order anyway.
         """
-        key = (request.policy, request.episode.session_id)
+        key = (request.policy, request.session_id)
         before = self.find(*key)
         if before is None or request.connection is None or request.connection != before.connection:
             await check_client(request)
@@ -101,7 +101,7 @@ class MemorySessions:
 
 def overtaken(request: Request) -> RlservoError:
     """Return the error for a request whose session was begun again meanwhile."""
-    shown = f"session '{request.episode.session_id!s:.64}' of policy '{request.policy[:64]}'"
-    if request.episode.reset:
+    shown = f"session '{request.session_id!s:.64}' of policy '{request.policy[:64]}'"
+    if request.reset:
         return UnavailableError(f"another request started {shown} at the same time: try again")
     return SessionError(f"the request belongs to an earlier episode: another one has restarted {shown} since")

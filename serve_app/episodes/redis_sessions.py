@@ -73,7 +73,7 @@ class RedisSessions:
 
     async def act(self, store: PolicyStore, request: Request, step_session: StepSession) -> Decision:
         """Decide for a request of a session, as `MemorySessions.act`. Also raises DeadlineError."""
-        named = json.dumps([request.policy, request.episode.session_id]).encode()
+        named = json.dumps([request.policy, request.session_id]).encode()
         key = "rlservo:session:" + hashlib.blake2b(named, digest_size=16).hexdigest()
         stamp, run, session = await self._load(key, store, request)
         begun = None if session is None else session.begun

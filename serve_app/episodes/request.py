@@ -6,7 +6,7 @@ import hashlib
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from rlservo.export.contract.errors import DeadlineError
@@ -31,35 +31,6 @@ def shorten_label(label: str) -> str:
         return label
     digest = hashlib.blake2b(label.encode("utf-8", "surrogatepass"), digest_size=8).hexdigest()
     return f"{label[: LONGEST_LABEL - len(digest) - 1]}.{digest}"
-
-
-@dataclass(frozen=True, slots=True)
-class Episode:
-    """Fields of a request about its episode. A client may send only these."""
-
-    state: Mapping[str, Any] | None = None
-    """The recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: not
-    carried."""
-
-    session_id: SessionId | None = None
-    reset: bool = False  # begin the session, or the stream's episode
-    end: bool = False  # forget the session after this request
-    reward: Any = None
-    final_status: str | None = None
-    """End of the episode, in the client's words: the observation is the one after its last action."""
-
-    truncated: bool = False  # whether it was cut off, as by a time limit
-    last_action: Any = None  # the robot's last command, if the step from it is limited
-
-    @property
-    def begins(self) -> bool:
-        """Whether it is the episode's first request."""
-        return self.reset or (self.state is not None and not self.state)
-
-
-EPISODE_FIELDS = frozenset(each.name for each in fields(Episode))
-NO_EPISODE = Episode()
-"""Of a request with none of its fields."""
 
 
 @dataclass(slots=True)
@@ -110,11 +81,26 @@ class Request:
     """[ms] After `received`; a request that is late by then is not computed."""
     timestamp: float | None = None
     """[s] The client's clock, echoed in the reply."""
-    episode: Episode = NO_EPISODE
+    state: Mapping[str, Any] | None = None
+    """The recurrent state that the client carries (see `carried_state.py`); empty at an episode's start. None: not
+    carried."""
+    session_id: SessionId | None = None
+    reset: bool = False  # begin the session, or the stream's episode
+    end: bool = False  # forget the session after this request
+    reward: Any = None
+    final_status: str | None = None
+    """End of the episode, in the client's words: the observation is the one after its last action."""
+    truncated: bool = False  # whether it was cut off, as by a time limit
+    last_action: Any = None  # the robot's last command, if the step from it is limited
     non_finite: bool = False
     """Whether its JSON held NaN or Infinity, which JSON does not have."""
     reply_options: Any = None
     """Form of the reply, from the codec's `parse` to its `encode`."""
+
+    @property
+    def begins(self) -> bool:
+        """Whether it is its episode's first one."""
+        return self.reset or (self.state is not None and not self.state)
 
 
 class ClientGoneError(Exception):
@@ -152,14 +138,12 @@ def reply_fields(request: Request, decision: Decision) -> dict[str, Any]:
         fields["seq"] = request.seq
     if decision.notices:
         fields["warnings"] = decision.notices
-    episode = decision.episode
-    if episode is not None:
-        if episode.session_id is not None:
-            fields["session_id"] = episode.session_id
-        if episode.step is not None:
-            fields["session_step"] = episode.step
-        if episode.state is not None:
-            fields["state"] = episode.state
+    if decision.session_id is not None:
+        fields["session_id"] = decision.session_id
+    if decision.session_step is not None:
+        fields["session_step"] = decision.session_step
+    if decision.state is not None:
+        fields["state"] = decision.state
     if request.timestamp is not None:
         now = time.time()
         fields["timestamp"] = request.timestamp

@@ -65,7 +65,7 @@ class JsonCodec:
             check_json(handler.store(), request.policy, content, handler.settings.max_batch)
         document, request.non_finite = parse_json(content, such_as=SUCH_AS)
         if len(document) > 1 or "obs" not in document:  # not the usual request
-            request.episode = fill_request(request, parse_fields(ACT, document))
+            fill_request(request, parse_fields(ACT, document))
             if "obs" not in document:
                 raise ObservationError(f"the request has no 'obs': send {SUCH_AS}")
         request.obs = document["obs"]

@@ -19,7 +19,7 @@ from pydantic_core import from_json
 from typing_extensions import TypedDict
 
 from rlservo.export.contract.errors import RequestError
-from rlservo.serve_app.episodes.request import EPISODE_FIELDS, LONGEST_SESSION_ID, NO_EPISODE, Episode, Request
+from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, Request
 from rlservo.serve_app.wire.request_names import LONGEST_STATUS
 
 MAX_SEED = 2**63 - 1
@@ -100,16 +100,11 @@ def parse_fields(kind: TypeAdapter[Any], document: Mapping[Any, Any], what: str 
     raise RequestError(f"'{place}' must {expected}, got {json_type(first['input'])}")
 
 
-def fill_request(request: Request, given: Mapping[str, Any]) -> Episode:
-    """Set a request's options to checked fields; return those of its episode."""
-    said = {}
+def fill_request(request: Request, given: Mapping[str, Any]) -> None:
+    """Set a request's fields to checked ones; those that only a protocol has are left to it."""
     for name, value in given.items():
-        if value is not None:
-            if name in EPISODE_FIELDS:
-                said[name] = value
-            elif name in Options.__optional_keys__:
-                setattr(request, name, value)
-    return Episode(**said) if said else NO_EPISODE
+        if value is not None and name in ActRequest.__optional_keys__:
+            setattr(request, name, value)
 
 
 def parse_json(body: bytes | bytearray | memoryview, *, such_as: str) -> tuple[dict[str, Any], bool]:

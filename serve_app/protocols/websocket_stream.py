@@ -36,7 +36,7 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
 )
 from rlservo.export.contract.spaces import DictSpec
-from rlservo.serve_app.episodes.request import Episode, Request, new_episode_id, reply_fields
+from rlservo.serve_app.episodes.request import Request, new_episode_id, reply_fields
 from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.protocols.error_statuses import describe, error_answer, send_reply
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields
@@ -221,11 +221,11 @@ class MsgpackCodec:
             request.obs = content
             if type(content.get("reset")) is bool and not _names(handler, request, "reset"):
                 request.obs = {name: value for name, value in content.items() if name != "reset"}
-                request.episode = Episode(reset=content["reset"])
+                request.reset = content["reset"]
         else:
             request.obs = content["obs"]
             if len(content) > 1:
-                request.episode = fill_request(request, parse_fields(ACT, content))
+                fill_request(request, parse_fields(ACT, content))
 
     def encode(self, request: Request, decision: Decision) -> bytes:
         """Return the reply's frame; `reply_options` are further timings."""

@@ -28,7 +28,7 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
 )
 from rlservo.serve_app.episodes.episodes import Episodes
-from rlservo.serve_app.episodes.request import NO_EPISODE, ClientGoneError, Request, check_deadline
+from rlservo.serve_app.episodes.request import ClientGoneError, Request, check_deadline
 from rlservo.serve_app.server.access_checks import StreamKey
 from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
@@ -140,8 +140,7 @@ class RequestHandler:
             codec.parse(self, request, content)
             if request.explore and not request.may_explore:
                 raise ForbiddenError(NO_EXPLORING)
-            if request.label is not None or request.episode is not NO_EPISODE:
-                _check_names(request)
+            _check_names(request)
             if request.non_finite:
                 decision = await self._decide_non_finite(request)
             else:
@@ -159,8 +158,8 @@ class RequestHandler:
             raise InternalError(BUG) from error
         taken = time.perf_counter() - request.received
         self.metrics.record_answer(request.protocol, decision, taken)
-        if request.episode.final_status is not None:
-            self._count_end(request, decision, request.episode.final_status)
+        if request.final_status is not None:
+            self._count_end(request, decision, request.final_status)
         if self.recorder is not None:
             self.recorder.note_answer(request, decision, taken)
         if self.settings.log_requests:
@@ -225,9 +224,8 @@ class RequestHandler:
 
     def _count_end(self, request: Request, decision: Decision, status: str) -> None:
         """Count an episode that ended, unless its requests were divided between versions at random."""
-        carries_state = decision.episode is not None and decision.episode.state is not None
-        drawn = request.version is None and not carries_state and self.store().is_drawn(decision.name, request.label)
-        if not drawn and not decision.is_repeat:
+        may_vary = request.version is None and decision.state is None
+        if not (may_vary and self.store().is_drawn(decision.name, request.label)) and not decision.is_repeat:
             self.metrics.count_end(decision, status)
 
     def _admit(self, request: Request) -> None:
@@ -241,7 +239,7 @@ class RequestHandler:
 
     async def _decide_non_finite(self, request: Request) -> Decision:
         """Refuse numbers that JSON lacks, naming the element if it is one of the observation's."""
-        if request.episode is NO_EPISODE:  # otherwise a session would advance
+        if request.session_id is None:  # otherwise a session would advance
             try:
                 await self.decide(request)
             except ObservationError as error:
@@ -271,9 +269,8 @@ def _is_stricter(store: PolicyStore, request: Request, version: str) -> bool:
 
 def _check_names(request: Request) -> None:
     """Refuse an API key in an episode's name or end, which would reach recordings, metrics and logs."""
-    episode = request.episode
-    said = {"x-session-id": request.label, "session_id": episode.session_id, "final_status": episode.final_status}
+    said = {"x-session-id": request.label, "session_id": request.session_id, "final_status": request.final_status}
     for name, text in said.items():
         if type(text) is str and A_KEY.search(text):
-            request.label, request.episode = None, NO_EPISODE
+            request.label = request.session_id = request.final_status = None
             raise RequestError(f"'{name}' holds an API key, which would be recorded: send another name")

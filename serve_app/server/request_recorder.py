@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError
 from rlservo.export.contract.extras import needs_extra
-from rlservo.serve_app.episodes.request import Episode, Request, shorten_label
+from rlservo.serve_app.episodes.request import Request, shorten_label
 from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.runtime.exploration import Draw
 from rlservo.serve_app.runtime.input_numbers import parse_array
@@ -98,17 +98,16 @@ class RequestRecorder:
 
     def _record_answer(self, request: Request, decision: Decision, taken_s: float, draw: Draw | None) -> None:
         policy = decision.policy
-        said = request.episode
-        episode, step = self._place(request, decision, said)
+        episode, step = self._place(request, decision)
         known, rows = self._format(policy), decision.batch or 1
         # Copies: binary input is a view of the whole request's body, which may be a thousand times as large.
         obs = LeafArrays({name: decision.inputs[name].copy() for name in known.observations.leaves})
-        ends = said.final_status is not None
-        reward = None if said.reward is None else _numbers(said.reward, rows)
-        if episode and step and (ends or reward is not None or said.last_action is not None):
+        ends = request.final_status is not None
+        reward = None if request.reward is None else _numbers(request.reward, rows)
+        if episode and step and (ends or reward is not None or request.last_action is not None):
             outcome = OutcomeRecord(
-                known, episode, step - 1, reward, ends and not said.truncated, ends and said.truncated,
-                said.final_status, obs if ends else None, said.last_action, rows=rows,
+                known, episode, step - 1, reward, ends and not request.truncated, ends and request.truncated,
+                request.final_status, obs if ends else None, request.last_action, rows=rows,
                 may_teach=request.may_explore,
             )  # fmt: skip
             self.recorder.record(outcome)
@@ -127,10 +126,9 @@ class RequestRecorder:
         self.recorder.record(record)
 
     def _record_failure(self, request: Request, store: PolicyStore, code: str, taken_ms: float) -> None:
-        said = request.episode
-        if said.final_status is not None:
+        if request.final_status is not None:
             return  # no decision was requested; the episode continues until its end is reported
-        session_id = said.session_id
+        session_id = request.session_id
         label = request.label if session_id is None else str(session_id)
         try:
             stream = request.stream
@@ -146,27 +144,26 @@ class RequestRecorder:
             arrays = known.observations.arrays(request.obs)
         except Exception:  # it may be anything: it has not been checked yet
             return
-        carries_state = policy.is_stateful and said.state is not None
+        carries_state = policy.is_stateful and request.state is not None
         episode = "" if carries_state else _episode_of(request)
-        step = self._count(policy.contract.name, episode, said.begins) if episode else 0
+        step = self._count(policy.contract.name, episode, request.begins) if episode else 0
         record = DecisionRecord(
             known, LeafArrays({name: array.copy() for name, array in arrays.items()}), None, episode, step, taken_ms,
             request.explore, seq=request.seq, request_id=_request_id(request), error=code,
         )  # fmt: skip
         self.recorder.record(record)
 
-    def _place(self, request: Request, decision: Decision, said: Episode) -> tuple[str, int]:
+    def _place(self, request: Request, decision: Decision) -> tuple[str, int]:
         """Return (episode, step)."""
-        note = decision.episode
-        if note is not None and note.recorded_step is not None:
-            return note.recorded_step
+        if decision.recorded_step is not None:
+            return decision.recorded_step
         episode = _episode_of(request)
         if not episode:
             return "", 0
         # A memory that continues does not begin an episode, even if its end was reported or it was forgotten here.
-        least = note.step - 1 if note is not None and note.step is not None and decision.policy.is_stateful else 0
-        step = self._count(decision.name, episode, said.begins, least)
-        if said.end or said.final_status is not None:
+        least = decision.session_step - 1 if decision.session_step is not None and decision.policy.is_stateful else 0
+        step = self._count(decision.name, episode, request.begins, least)
+        if request.end or request.final_status is not None:
             del self._steps[decision.name, episode]
         return episode, step
 
@@ -190,7 +187,7 @@ class RequestRecorder:
 
 def _episode_of(request: Request) -> str:
     """Return a request's episode: its session, its stream, or everything under its label."""
-    session_id = request.episode.session_id
+    session_id = request.session_id
     session = f"#{session_id}" if isinstance(session_id, int) else session_id  # 7 and "7" are different sessions
     return session or request.stream_id or shorten_label(request.label or "")
 

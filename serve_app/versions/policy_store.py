@@ -28,16 +28,6 @@ class EpisodeStep(NamedTuple):
     step: int
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeNote:
-    """Fields of a reply about its episode."""
-
-    state: Mapping[str, Any] | None = None  # for the client to carry, as `carried_state.py` has it
-    session_id: str | int | None = None
-    step: int | None = None  # how many actions this session or stream has given since its episode began
-    recorded_step: EpisodeStep | None = None  # which it was, where the client carries the state and it is recorded
-
-
 @dataclass(slots=True)  # not frozen: that would cost every request half a microsecond
 class Decision:
     """An action, and the policy, version and time that it took."""
@@ -52,7 +42,10 @@ class Decision:
     infer_ms: float  # [ms] checking the observation, the network, checking the action
     batch: int | None = None  # how many observations there were; None for one that came alone
     notices: tuple[str, ...] = ()  # what was out of bounds or limited, and used all the same
-    episode: EpisodeNote | None = None
+    state: Mapping[str, Any] | None = None  # for the client to carry, as `carried_state.py` has it
+    session_id: str | int | None = None
+    session_step: int | None = None  # actions of this session or stream since its episode began
+    recorded_step: EpisodeStep | None = None  # this one, where the client carries the state and it is recorded
     last_action: Mapping[str, NDArray[Any]] | None = None  # which the client gave, by tensor name `[batch, *shape]`
     is_repeat: bool = False  # the answer to a session's last request once more
 

@@ -238,7 +238,7 @@ def fill(handler: RequestHandler, request: Request, document: Mapping[str, Any],
     if not parameters and len(inputs) == 1:  # the usual request
         return
     deadlines = (request.deadline_ms, parameters.get("deadline_ms"), (parameters.get("timeout") or 0) / 1e3 or None)
-    request.episode = fill_request(
+    fill_request(
         request,
         {
             **parameters,
