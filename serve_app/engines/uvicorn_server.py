@@ -305,6 +305,8 @@ class _Supervisor(Multiprocess):
 
     def keep_subprocess_alive(self) -> None:
         """Replace workers that died or hang; report once when all are ready."""
+        for process in self.processes:
+            process.child_conn.close()  # the worker has its own: if it dies in a health check, the wait for it ends
         super().keep_subprocess_alive()
         if self._on_ready is not None and all(process.is_ready() for process in self.processes):
             self._on_ready()
