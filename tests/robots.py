@@ -114,7 +114,9 @@ class GrpcConnection:
     async def ask(self, request: dict[str, Any]) -> tuple[int, Any, int | None]:
         """Send one request. Raises ConnectionError."""
         if self._channel is None:
-            options = [("grpc.use_local_subchannel_pool", 1)]
+            # The robots try again themselves. In grpcio 1.85 a channel's own retries may spin until the memory is full
+            # when Ray Serve's proxy has lost a replica.
+            options = [("grpc.use_local_subchannel_pool", 1), ("grpc.enable_retries", 0)]
             self._channel = grpc.aio.insecure_channel(self._address, options)
         obs = np.float32(request["obs"])
         message: Any = messages.ModelInferRequest(model_name=MODEL, raw_input_contents=[obs.tobytes()])
