@@ -16,7 +16,7 @@ from rlservo.envs.ur_controller.server import CannotListenError, ControllerServe
 
 PATIENCE_S = 60.0
 # Of a real arm in tests. The machine may be busy: the product's watchdog_hz is 10.
-LIMITS = {"watchdog_hz": 2.0, "start_speed": 1.0, "blend_s": 0.1}
+LIMITS = {"watchdog_hz": 1.0, "start_speed": 1.0, "blend_s": 0.1}
 _counter = itertools.count(os.getpid())
 
 
