@@ -180,9 +180,9 @@ class Run:
 
     def end(self, *signals: signal.Signals, folders: bool = True) -> int:
         """Send signals, wait for the end, assert that nothing is left; return the exit code."""
-        for number in signals:
+        for place, number in enumerate(signals):
+            time.sleep(0.3 if place else 0.0)
             self.process.send_signal(number)
-            time.sleep(0.3)
         code = self.process.wait(timeout=90)
         self._nothing_is_left(folders=folders)
         return code
