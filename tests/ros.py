@@ -210,17 +210,18 @@ class Ros:
 
     def begin_driving(self, *target: float, frame: str = "base_link") -> None:
         """Give a target and wait until the policy drives to it."""
-        episodes, given = int(self.heartbeat()["episodes"]), 0.0
+        beat, given = self.heartbeat(), 0.0
+        episodes = int(beat["episodes"])
 
         def is_taken() -> bool:
-            nonlocal given
-            beat = self.heartbeat()
+            nonlocal beat, given
             if int(beat["episodes"]) > episodes:
                 return True
             # A node that is new may not have discovered the publisher yet.
             if beat["state"] != "starting" and time.monotonic() > given + REPEAT_S:
                 given = time.monotonic()
                 self.give_target(*target, frame=frame)
+            beat = self.heartbeat()
             return False
 
         self.wait_until(is_taken)
