@@ -7,7 +7,6 @@ import math
 import os
 import signal
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -36,14 +35,25 @@ def sim(ros: Ros) -> Process:
     return sim
 
 
+@pytest.fixture(scope="module")
+def nodes() -> list[Process]:
+    """Nodes that tests have started: all but the last have ended."""
+    return []
+
+
 @pytest.fixture
-def node(ros: Ros, sim: Process, all_shipped: Path) -> Iterator[Process]:
-    """The node of a shipped policy."""
-    node = start_node(ros, all_shipped)
-    try:
-        yield node
-    finally:
-        node.close()
+def node(ros: Ros, sim: Process, all_shipped: Path, nodes: list[Process]) -> Process:
+    """The node of a shipped policy; tests share it until one ends it."""
+    if not nodes or nodes[-1].process.poll() is not None:
+        nodes.append(start_node(ros, all_shipped))
+    return nodes[-1]
+
+
+@pytest.fixture
+def free_arm(sim: Process, nodes: list[Process]) -> None:
+    """An arm that no node commands."""
+    for one in nodes:
+        one.close()
 
 
 def start_node(ros: Ros, all_shipped: Path, *options: object, url: str = "") -> Process:
@@ -148,22 +158,6 @@ def test_late_stamps_and_a_lost_topic_stop_the_arm(ros: Ros, sim: Process, node:
         sim.type("up")
 
 
-def test_killed_processes_leave_a_standing_arm(ros: Ros, sim: Process, node: Process) -> None:
-    node.wait_for("check -> ready")
-    get_moving(ros)
-    stream = node.children()[0]
-    began_s = time.time()
-    os.kill(stream, signal.SIGKILL)
-    assert ros.moved_for(began_s) < BRAKING_S
-    node.wait_for("was killed")
-    get_moving(ros)  # with a new one
-    stream = node.children()[0]
-    began_s = time.time()
-    node.process.kill()
-    assert ros.moved_for(began_s) < BRAKING_S
-    ros.wait_until(lambda: not Path(f"/proc/{stream}").exists())
-
-
 def test_process_that_does_not_run_stops_the_arm_and_goes_on_later(ros: Ros, sim: Process, node: Process) -> None:
     node.wait_for("check -> ready")
     for begin, is_stream in ((get_moving, False), (get_moving, True), (get_returning, False)):
@@ -193,8 +187,24 @@ def test_stopped_robot_does_not_move_again_before_a_new_target(ros: Ros, sim: Pr
     get_moving(ros)
 
 
+def test_killed_processes_leave_a_standing_arm(ros: Ros, sim: Process, node: Process) -> None:
+    node.wait_for("check -> ready")
+    get_moving(ros)
+    stream = node.children()[0]
+    began_s = time.time()
+    os.kill(stream, signal.SIGKILL)
+    assert ros.moved_for(began_s) < BRAKING_S
+    node.wait_for("was killed")
+    get_moving(ros)  # with a new one
+    stream = node.children()[0]
+    began_s = time.time()
+    node.process.kill()
+    assert ros.moved_for(began_s) < BRAKING_S
+    ros.wait_until(lambda: not Path(f"/proc/{stream}").exists())
+
+
 def test_slow_server_holds_the_arm_instead_of_moving_it_late(
-    ros: Ros, sim: Process, all_shipped: Path, tmp_path: Path
+    ros: Ros, free_arm: None, all_shipped: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "ur_positioning").symlink_to(all_shipped / "ur_positioning")
     app = SlowServer(tmp_path)
@@ -211,7 +221,7 @@ def test_slow_server_holds_the_arm_instead_of_moving_it_late(
         assert node.end() == 0
 
 
-def test_latency_of_the_arm_is_measured_through_topics(ros: Ros, sim: Process) -> None:
+def test_latency_of_the_arm_is_measured_through_topics(ros: Ros, free_arm: None) -> None:
     words = ("robot-latency", f"ros2:prefix={PREFIX}", "--ur-model", "ur5", "--steps", 5, "--yes", "--json")
     measuring = ros.rlservo(*words)
     assert measuring.end(0) == 0, measuring.lines
