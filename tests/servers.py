@@ -154,6 +154,7 @@ class Run:
     grpc_port: int | None = None
     key_file: Path | None = None
     output: list[str] = field(default_factory=list)
+    reader: threading.Thread | None = None
 
     def wait_until_ready(self) -> None:
         """Wait until the server prints that it is ready; what it prints, its log, is kept in `output`."""
@@ -162,7 +163,8 @@ class Run:
             self.output.append(line)
             if line.startswith("READY"):
                 # Read on, so that the pipe never fills.
-                threading.Thread(target=self.output.extend, args=(self.process.stdout,), daemon=True).start()
+                self.reader = threading.Thread(target=self.output.extend, args=(self.process.stdout,), daemon=True)
+                self.reader.start()
                 return
         raise AssertionError("".join(self.output))
 
@@ -233,13 +235,16 @@ def running(arguments: Sequence[str], port: int, **environment: str) -> Iterator
         env=variables,
         cwd=ROOT,
     )
+    run = Run(process, port, run_id)
     try:
-        yield Run(process, port, run_id)
+        yield run
     finally:
         for pid in processes_of(run_id):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         process.wait()
+        if run.reader is not None:
+            run.reader.join(20)
         assert process.stdout is not None
         process.stdout.close()
         shutil.rmtree(temporary, ignore_errors=True)
