@@ -88,9 +88,6 @@ LONGEST = (
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
 )  # fmt: skip
 
-# Tests of robots whose time is real. What the other processes compute would delay their control cycles.
-REAL_TIME = ("tests/deploy/ros2/", "tests/envs/robots/", "tests/envs/ros2/", "tests/envs/ur_controller/")
-
 # Servers and Rays that tests share. An unused one still takes a tenth of a core or more.
 RUNNING = {"live_server", "shipped_server", "cluster", "one_ray"}
 
@@ -148,18 +145,6 @@ class SharedFixtures:
             while self._running:
                 fixturedef, request = self._running.pop()
                 fixturedef.finish(request)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Any:
-    """Run real-time tests, and what they start, before all else; only root may, as CI is."""
-    if not item.nodeid.startswith(REAL_TIME) or os.geteuid() != 0:
-        return (yield)
-    os.setpriority(os.PRIO_PROCESS, 0, -10)
-    try:
-        return (yield)
-    finally:
-        os.setpriority(os.PRIO_PROCESS, 0, 0)
 
 
 def pytest_configure(config: pytest.Config) -> None:
