@@ -68,24 +68,20 @@ TOGETHER = {
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
-# The longest begin first, by the processor time and the waiting that each has alone: what is left for the end is short,
-# and those that compute (the trainings) run beside those that mostly wait (the robots). The files with slow tests
-# follow, then the rest.
+# The longest files begin first, and those that mostly wait early, next to those that compute: none is left for the end.
+# The files with slow tests follow, then the rest.
 LONGEST = (
-    "one Ray", "tests/envs/ros2/test_ros_arm.py", "tests/system/test_documents_run.py", "live server",
-    "ports of server managers", "tests/system/test_embedded_server.py", "tests/envs/ros2/test_ros_base.py",
-    "shipped server", "cluster", "tests/envs/robots/test_real_arm.py", "tests/deploy/ros2/test_mapped_node.py",
-    "tests/serve_app/repository/test_remote_repository.py", "tests/envs/ros2/test_rosbridge_base.py",
-    "tests/system/test_demo.py", "tests/export/proof/test_exploration.py", "tests/deploy/cockpit/test_page.py",
-    "tests/test_python_versions.py", "tests/examples/test_on_a_cluster.py", "tests/export/rllib/test_multi_agent.py",
-    "tests/serve_app/learning/test_online_learning.py", "tests/export/rllib/test_filter_statistics.py",
-    "tests/serve_app/engines/test_connection_bounds.py", "tests/serve_app/client/test_bad_line.py",
-    "tests/system/test_promotion.py", "several nodes", "tests/export/rllib/test_new_stack.py",
-    "tests/export/rllib/test_reported.py", "tests/test_extras.py", "tests/envs/robots/test_stopping.py",
-    "tests/envs/robots/test_latency.py", "sweep",
+    "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
+    "tests/serve_app/repository/test_remote_repository.py", "ports of server managers",
+    "tests/deploy/cockpit/test_page.py", "tests/system/test_documents_run.py",
+    "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
+    "tests/system/test_embedded_server.py", "sweep",
+    "tests/export/rllib/test_new_stack.py", "several nodes",
+    "tests/serve_app/client/test_bad_line.py",
+    "tests/system/test_remote_repository.py",
     # of `make quick`
-    "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_current_keys.py",
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
+    "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_current_keys.py",
 )  # fmt: skip
 
 # Servers and Rays that tests share. An unused one still takes a tenth of a core or more.
