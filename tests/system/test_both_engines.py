@@ -215,8 +215,15 @@ def test_no_request_fails_while_the_production_version_changes_on_a_cluster(clus
                 while in_a_row < 20:  # both replicas follow
                     in_a_row = in_a_row + 1 if np.allclose(policy.act(OBS), right, rtol=1e-6) else 0
                     assert time.monotonic() < deadline
-        admin.unload("ur5", "2")
+        plan = admin.unload("ur5", "2")["generation"]
     assert load.asked > 50 and (load.wrong, load.failures) == (0, [])
+    following: dict[str, int] = {}
+    deadline = time.monotonic() + 30
+    while [*following.values()] != [plan, plan]:  # by a connection for each look
+        assert time.monotonic() < deadline, following
+        with cluster.admin() as admin:
+            shown = admin.listing()
+        following[shown["replica"]] = shown["generation"]
 
 
 def test_a_replica_that_is_killed_is_replaced_and_its_clients_ask_another(cluster: Cluster, load: Load) -> None:
