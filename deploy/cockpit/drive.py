@@ -68,9 +68,10 @@ class Drive:
         """
         self._source, self._recorder = source, recorder
         self._choice, self._link = choice, Link()
-        self._use(source.open(choice, self._link))
+        self._policy = source.open(choice, self._link)
         try:
-            contract = self._policy.contract
+            self._use(self._policy)
+            contract = self._contract
             arguments = {**(home_arguments(contract) if env_id is None else {}), **(env_arguments or {})}
             self._stage = Stage(env_id or home_of(contract), arguments, contract, unproven=unproven)
         except BaseException:
@@ -301,7 +302,8 @@ class Drive:
             self._end(info, is_arrival=terminated and bool(success_of(info)))
 
     def _act(self) -> Any:
-        has_reward = any(tensor.name == REWARD for tensor in self._policy.contract.inputs)
+        self._contract = self._policy.contract  # which asks a server again where an alias may have moved
+        has_reward = any(tensor.name == REWARD for tensor in self._contract.inputs)
         reward: dict[str, Any] = {REWARD: self._reward} if has_reward else {}
         return self._acting.act(self._obs, **reward)
 
@@ -431,6 +433,7 @@ class Drive:
         """Act with a policy from now on."""
         self._policy = policy
         self._acting = policy if self._recorder is None else WithRecording(policy, self._recorder)
+        self._contract = policy.contract
 
     def _late_beyond_ms(self) -> float:
         return min(self._link.deadline_ms, 1e3 * self._stage.cycle_s)
@@ -469,7 +472,7 @@ class Drive:
         ghost = self._ghost
         return View(
             stage=self._stage,
-            contract=self._policy.contract,
+            contract=self._contract,
             before=self._before,
             after=self._after,
             since=self._since,

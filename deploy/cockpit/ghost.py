@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.deploy.cockpit.stage import Scene, Stage
-from rlservo.export.contract.contract import Contract
 from rlservo.serve_app.interface import ActingPolicy, Closeable
 
 
@@ -18,17 +17,12 @@ class Ghost(Closeable):
     def __init__(self, policy: ActingPolicy, like: Stage) -> None:
         """Build the same robot again. Raises UsageError if the policy does not fit it; then the caller keeps it."""
         self.stage = Stage(like.env_id, like.arguments, policy.contract)
-        self._policy = policy
+        self._policy, self.contract = policy, policy.contract
         self._obs: Any = None
         self._is_over = False
         scene = self.stage.scene()
         self.scenes: tuple[Scene, Scene] = scene, scene
         """Before and after the last control cycle."""
-
-    @property
-    def contract(self) -> Contract:
-        """The policy's."""
-        return self._policy.contract
 
     def begin(self, like: Stage) -> None:
         """Begin an episode at the robot's pose, with the same target."""
@@ -44,6 +38,7 @@ class Ghost(Closeable):
         """
         # Two rows, two episodes side by side: one follows the robot's observations, one the ghost's own.
         follows, own = self._policy.act(np.stack([obs, self._obs]))
+        self.contract = self._policy.contract
         if not self._is_over:
             self._obs, _, terminated, truncated, _ = self.stage.step(own)
             self._is_over = terminated or truncated

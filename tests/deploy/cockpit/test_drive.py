@@ -238,8 +238,11 @@ def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(two_versions: 
     try:
         wait_for(lambda: drive.view.trouble.startswith("waiting for the policy"), "it is said")
         cycles = drive.history[-1].number
-        drive.do(lambda: drive.set_speed(1.0))  # an answered command shows the thread is alive
-        wait_for(lambda: drive.view.period_s > 0, "a view")
+        drive.do(lambda: drive.begin("own"))  # from now on the alias is to be looked up again
+        drive.do(lambda: drive.set_speed(2.0))
+        period_s = drive.view.period_s
+        wait_for(lambda: drive.view.period_s < period_s, "a view that is twice as fast")
+        drive.do(lambda: drive.set_speed(1.0))
         assert drive.history[-1].number <= cycles + 1
         with served_on(app, free_port):
             wait_for(lambda: drive.view.trouble == "" and drive.history[-1].number > cycles + 3, "it drives on")
