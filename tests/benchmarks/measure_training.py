@@ -11,7 +11,7 @@ import measuring
 import training
 
 training.warm_up()
-rows = [training.measure("CartPole-v1", 1, 4, 1, 512, limit) for limit in (0.5, 200.0)]
+rows = [training.measure("CartPole-v1", 1, 4, 1, 512, limit) for limit in (0.05, 200.0)]
 for row in rows:
     print(training.line(row))
 measuring.write(Path(), "training", training.document(rows, "CartPole-v1", 512))
