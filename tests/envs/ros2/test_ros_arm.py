@@ -176,8 +176,9 @@ def test_process_that_does_not_run_stops_the_arm_and_goes_on_later(ros: Ros, sim
 def test_stopped_robot_does_not_move_again_before_a_new_target(ros: Ros, sim: Process, node: Process) -> None:
     node.wait_for("check -> ready")
     get_moving(ros)
+    seen = len(node.lines)  # of the tests before, which share the node
     sim.type("protective")
-    node.wait_for("fault: protective_stop")
+    node.wait_for("fault: protective_stop", after=seen)
     seen = len(node.lines)
     ros.give_target(*place(0.0))
     ros.wait_until(lambda: ros.heartbeat()["message"].startswith("fault: protective_stop"))
@@ -191,10 +192,10 @@ def test_killed_processes_leave_a_standing_arm(ros: Ros, sim: Process, node: Pro
     node.wait_for("check -> ready")
     get_moving(ros)
     stream = node.children()[0]
-    began_s = time.time()
+    seen, began_s = len(node.lines), time.time()
     os.kill(stream, signal.SIGKILL)
     assert ros.moved_for(began_s) < BRAKING_S
-    node.wait_for("was killed")
+    node.wait_for("was killed", after=seen)
     get_moving(ros)  # with a new one
     stream = node.children()[0]
     began_s = time.time()
