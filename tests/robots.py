@@ -114,8 +114,8 @@ class GrpcConnection:
     async def ask(self, request: dict[str, Any]) -> tuple[int, Any, int | None]:
         """Send one request. Raises ConnectionError."""
         if self._channel is None:
-            # The robots try again themselves. In grpcio 1.85 a channel's own retries may spin until the memory is full
-            # when Ray Serve's proxy has lost a replica.
+            # The robots try again themselves, so the channel does not. With its own retries grpcio 1.85 has filled
+            # 16 GB in some runs against two replicas that are killed; whether by them is not known.
             options = [("grpc.use_local_subchannel_pool", 1), ("grpc.enable_retries", 0)]
             self._channel = grpc.aio.insecure_channel(self._address, options)
         obs = np.float32(request["obs"])
