@@ -23,7 +23,7 @@ from rlservo.export.contract.errors import DeadlineError, RlservoError, UsageErr
 from rlservo.serve_app.interface import ActingPolicy
 from rlservo.serve_app.rollout.environment import check_fit, check_proven, make_env
 
-HEARTBEAT_S = 0.5  # at most; a change of the state is published at once
+HEARTBEAT_S = 0.5
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # DiagnosticStatus' levels
 # Environments of ours by the simulated one that a policy was trained in, and the frame of their target.
 REAL = {
@@ -69,7 +69,7 @@ class PolicyNode:
         self.counts: dict[str, int] = {"decisions": 0, "episodes": 0, "successes": 0, "held": 0, "late": 0}
         self.wanted = Wanted.RUN if autostart else Wanted.STOP
         self._diagnose = self.link.advertise("/diagnostics", DIAGNOSTICS)
-        self._is_closed, self._has_changed = threading.Event(), threading.Event()
+        self._is_closed = threading.Event()
         for word in Wanted:
             self.link.serve(f"~/{'start' if word is Wanted.RUN else word.value}", self._setter(word))
         contract = policy.contract
@@ -86,16 +86,14 @@ class PolicyNode:
         return found
 
     def enter(self, state: str, why: str = "") -> None:
-        """Change the state: a heartbeat and a line in the log where more than a number of it is new."""
-        before, self.state, self.why = (self.state, self.why), state, why
-        if (state, NUMBER.sub("", why)) != (before[0], NUMBER.sub("", before[1])):
-            log.info("node: %s -> %s%s", before[0], state, f": {why}" if why else "")
-            self._has_changed.set()
+        """Change the state: a line in the log where more than a number of it is new, and the next heartbeat."""
+        if (state, NUMBER.sub("", why)) != (self.state, NUMBER.sub("", self.why)):
+            log.info("node: %s -> %s%s", self.state, state, f": {why}" if why else "")
+        self.state, self.why = state, why
 
     def close(self) -> None:
         """Leave the graph."""
         self._is_closed.set()
-        self._has_changed.set()
         self._thread.join()
         self.link.close()
 
@@ -107,11 +105,7 @@ class PolicyNode:
         return answer
 
     def _beat(self) -> None:
-        while True:
-            self._has_changed.wait(HEARTBEAT_S)
-            if self._is_closed.is_set():
-                return
-            self._has_changed.clear()
+        while not self._is_closed.wait(HEARTBEAT_S):
             contract = self.policy.contract
             facts = {"state": self.state, "policy": contract.name, "version": contract.version, **self.counts}
             level = {"fault": ERROR, "holding": WARN, "waiting": WARN, "refused": WARN}.get(self.state, OK)
