@@ -2,7 +2,8 @@
 
 The state travels with request and reply (`state`), or stays on the server under a session's id or with a stream. The
 request must say which: a recurrent policy that silently began an episode with every request would act wrongly and look
-right. A state only reaches the version that it belongs to. A refused request does not change it.
+right. A state only reaches the version that it belongs to. A refused request does not change it, unless a shared store
+took the write and did not answer.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ class RedisSessions:
                 if time.perf_counter() - request.received > self._patience_s:
                     raise OverloadedError(f"other requests kept the session busy for {self._patience_s:g} s: try again")
                 reply = await script(keys=[key], args=arguments)
-        except (RedisError, OSError) as error:
+        except (RedisError, OSError, RuntimeError) as error:  # the last is uvloop's for a closed connection
             self.unreachable += 1
             if not self._is_down:
                 self._is_down = True

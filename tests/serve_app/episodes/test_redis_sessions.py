@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import signal
+import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -225,6 +227,30 @@ def test_without_redis_sessions_are_503_and_work_again_when_it_is_back(
     assert servers.metric("rlservo_session_store_failures_total") == 2
     said = [record.message for record in caplog.records if "Redis" in record.message]
     assert sum("cannot be used" in line for line in said) == sum("again" in line for line in said) == 2  # each server
+
+
+def test_a_proxy_without_a_redis_behind_it_is_503(store: PolicyStore, served: Serve) -> None:
+    def reset_connections() -> None:
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                connection = listener.accept()[0]
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                connection.close()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener, ThreadPoolExecutor(9) as pool:
+        pool.submit(reset_connections)
+        settings = ServerSettings(session_store=f"redis://127.0.0.1:{listener.getsockname()[1]}/0")
+        try:
+            with served(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as port:
+
+                def ask(_: int) -> tuple[int, str]:
+                    with contextlib.closing(Servers(port)) as server:
+                        status, reply = server.act(SEEN[0], reset=True)
+                        return status, reply["code"]
+
+                assert set(pool.map(ask, range(32))) == {(503, "unavailable")}
+        finally:
+            listener.shutdown(socket.SHUT_RDWR)
 
 
 def test_a_full_redis_refuses_a_step_and_leaves_the_memory_where_it_was(
