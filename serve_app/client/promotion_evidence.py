@@ -1,7 +1,8 @@
 """Evidence of a promotion: the growth of the servers' counts of a policy since it began, against its limits.
 
 A process counts from its own start, so its increments between two checks are summed. A process that disappears keeps
-its sum, and a new one counts from its first check. Counters never fall: metrics that do are not trusted.
+its sum, and a new one counts from its first check. Counters that fall are not trusted, nor is an old copy, in which
+the uptime has not grown.
 
 A limit is the share of requests, actions or episodes that may count against a version: failed requests, requests slower
 than the p99 (1%), actions further apart (1%), episodes without success (production's share plus the drop). During the
@@ -21,11 +22,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from rlservo.export.contract.errors import UnavailableError, UsageError
 
-PLAN, LOADED = "rlservo_plan_generation", "rlservo_policy_loaded"
+PLAN, UPTIME, LOADED = "rlservo_plan_generation", "rlservo_uptime_seconds", "rlservo_policy_loaded"
 ANSWERS, OUTCOMES, ENDS = "rlservo_request_seconds_bucket", "rlservo_requests_total", "rlservo_episode_ends_total"
 DIFFERENCES, MISSED = "rlservo_shadow_difference_bucket", "rlservo_shadow_missed_total"
 READ = {  # the labels that distinguish a policy's series; those of other labels are summed
     PLAN: (),
+    UPTIME: (),
     LOADED: ("version",),
     ANSWERS: ("version", "le"),
     OUTCOMES: ("version", "code"),
@@ -43,16 +45,19 @@ class UntrustedError(UsageError):
 def read_metrics(text: str, policy: str) -> dict[str, Numbers]:
     """Return each process's numbers in a text for Prometheus. Raises UntrustedError, and UnavailableError for none."""
     processes: dict[str, Numbers] = {}
+    lines = set()
     try:
         families = text_string_to_metric_families(text)
         for name, labels, value, *_ in (sample for family in families for sample in family.samples):
-            if name in READ and (name == PLAN or labels["policy"] == policy):
-                if not 0 <= value < math.inf:
-                    raise UntrustedError(f"{name} {labels} is {value}")
+            if name in READ and (name in (PLAN, UPTIME) or labels["policy"] == policy):
+                line = (name, *sorted(labels.items()))
+                if not 0 <= value < math.inf or not float(labels.get("le", 0)) >= 0 or line in lines:
+                    raise UntrustedError(f"{name} {labels} is {value}, or there twice")
+                lines.add(line)
                 numbers = processes.setdefault(labels.get("replica", ""), {})
                 path = "/".join((name, *(labels[label] for label in READ[name])))
                 numbers[path] = numbers.get(path, 0.0) + value
-    except (ValueError, KeyError) as error:
+    except (ValueError, LookupError) as error:
         raise UntrustedError(f"the metrics cannot be read: {error!r}") from None
     if not processes:
         raise UnavailableError(f"the metrics have no series for policy '{policy}'")
@@ -99,6 +104,8 @@ class Counts:
         for name, numbers in processes.items():
             now = {path: count for path, count in numbers.items() if not path.startswith((PLAN, LOADED))}
             before = self.seen.get(name, now)
+            if name in self.seen and now.get(UPTIME) == before.get(UPTIME):
+                raise UnavailableError(f"the metrics of replica '{name}' are still those of the last check")
             for path in {**before, **now}:
                 grown = now.get(path, 0.0) - before.get(path, 0.0)
                 if grown < 0:
@@ -110,13 +117,11 @@ class Counts:
 Z = 3.0  # standard deviations of every interval, 99.7%: there are many checks, and each may err
 FEWEST = 3  # cases against a version before anything stops early
 TAIL = 0.01  # share of the requests and actions beyond a p99
-CLIENTS_OWN = frozenset(  # failures that are not the version's fault
-    {
-        *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
-        *("bad-observation", "session-conflict", "session-lost", "late", "over-capacity", "deadline-passed"),
-        "unavailable",
-    }
-)
+CLIENTS_OWN = {  # failures that are not the version's fault
+    *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
+    *("bad-observation", "session-conflict", "session-lost", "late", "over-capacity", "deadline-passed"),
+    "unavailable",
+}
 
 
 @dataclass(frozen=True)

@@ -74,6 +74,7 @@ class Metrics(Collector):
 
     def __init__(self, replica: str = "") -> None:
         self._replica = replica
+        self.began = time.monotonic()
         self.folder = os.environ.get(FOLDER_VARIABLE)  # that several workers share
         self._registry = registry = CollectorRegistry()
         self._counted = CollectorRegistry()  # what is sampled
@@ -258,6 +259,7 @@ def versions(handler: RequestHandler) -> None:
 def process(handler: RequestHandler) -> None:
     """Sample this process's queue, API keys and recording."""
     admission, keys, show = handler.admission, handler.keys, handler.metrics
+    show.gauge("rlservo_uptime_seconds", "Time since this process' start", time.monotonic() - show.began)
     waited = "Largest number of requests that waited for the processor at once, since the start"
     show.gauge("rlservo_queue_longest", waited, admission.longest)
     show.gauge("rlservo_requests_incoming", "Requests whose body is still arriving", admission.incoming)

@@ -139,7 +139,7 @@ def loaded(server: Server, clients: int = 3) -> Iterator[Load]:
 def promoting(server: Server, log: Path, version: str, *words: str) -> Iterator[subprocess.Popen[str]]:
     """Run `rlservo policy promote`, and end it where the test has not."""
     command = [sys.executable, "-m", "rlservo.deploy.cli", "policy", "promote", "ur5", version, "--log", str(log),
-               "--canary", "50%", "--max-error-rate", "5%", "--max-p99", "1s", "--every", "0.5", "--min-requests", "30",
+               "--canary", "50%", "--max-error-rate", "5%", "--max-p99", "1s", "--every", "1", "--min-requests", "30",
                "--url", server.url, "--key-file", str(server.key_file), *words]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:

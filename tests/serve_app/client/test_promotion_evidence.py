@@ -15,6 +15,7 @@ from rlservo.serve_app.client.promotion_evidence import (
     MISSED,
     OUTCOMES,
     PLAN,
+    UPTIME,
     Counts,
     Figure,
     Limits,
@@ -107,17 +108,30 @@ def test_actions_that_are_apart_or_could_not_be_computed_count_against_it() -> N
     assert left_out.lacks and left_out.cases == 0
 
 
-def counted(**replicas: float) -> dict[str, dict[str, float]]:
-    return {name: {"a": count, PLAN: 10 - count, f"{LOADED}/2": 0.0} for name, count in replicas.items()}
+def counted(uptime: float, **replicas: float) -> dict[str, dict[str, float]]:
+    return {
+        name: {"a": count, PLAN: 10 - count, UPTIME: uptime, f"{LOADED}/2": 0.0} for name, count in replicas.items()
+    }
 
 
 def test_counts_are_increments_over_processes_that_come_and_go() -> None:
     counts = Counts({}, {})
-    for look in ({"a": 100, "b": 50}, {"a": 110, "b": 60}, {"a": 112}, {"a": 112, "c": 7}, {"b": 61, "c": 9}):
-        counts.add(counted(**look))
-    assert counts.total == {"a": 10 + 10 + 2 + 1 + 2}  # b was out of sight; c counts from its first look
+    looks = ({"a": 100, "b": 50}, {"a": 110, "b": 60}, {"a": 112}, {"a": 112, "c": 7}, {"b": 61, "c": 9})
+    for uptime, look in enumerate(looks):
+        counts.add(counted(uptime, **look))
+    assert counts.total["a"] == 10 + 10 + 2 + 1 + 2  # b was out of sight; c counts from its first look
     with pytest.raises(UntrustedError, match="a of replica 'b' fell by 11: was its server restarted"):
-        counts.add(counted(b=50))
+        counts.add(counted(5, b=50))
+
+
+def test_a_copy_is_not_counted_and_nothing_is_counted_twice_after_it() -> None:
+    counts = Counts({}, {})
+    counts.add(counted(1, a=100))
+    for count in (100, 107):  # some of a worker's counts are newer than its uptime
+        with pytest.raises(UnavailableError, match="'a' are still those of the last check"):
+            counts.add(counted(1, a=count))
+    counts.add(counted(2, a=110))
+    assert counts.total["a"] == 10
 
 
 TEXT = """# TYPE rlservo_plan_generation gauge
@@ -151,6 +165,10 @@ def test_metrics_are_summed_over_protocols_for_each_process() -> None:
         ("} 7.0\nrlservo_policy", "} NaN\nrlservo_policy"),
         ("} 3.0", "} +Inf"),
         ("} 3.0", "} three"),
+        ('le="0.01"', 'le="abc"'),
+        ('le="0.01"', 'le="NaN"'),
+        (',protocol="json"', ',="json"'),
+        (TEXT, TEXT + TEXT),
     ],
 )
 def test_metrics_that_contradict_themselves_are_not_trusted(true: str, false: str) -> None:
