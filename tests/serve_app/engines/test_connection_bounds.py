@@ -202,6 +202,13 @@ def test_a_few_pipelined_requests_are_answered_in_order(server: Run) -> None:
             assert b"action" in replies.read(length)
 
 
+def test_more_pipelined_requests_are_refused(server: Run) -> None:
+    with others_are_answered(server), contextlib.closing(connected(server.port, 20)) as connection:
+        connection.sendall(WHOLE * (MAX_PIPELINED + 2))
+        received = b"".join(iter(lambda: connection.recv(65536), b""))
+        assert b"more than 32 requests were sent before the first one was answered" in received
+
+
 def test_a_refusal_before_the_body_reaches_a_client_that_still_sends(server: Run) -> None:
     """An early 401 neither loses its own reply nor anybody else's."""
     without_key = f"POST {PATH} HTTP/1.1\r\nhost: localhost\r\ncontent-length: 3000000\r\n\r\n".encode()

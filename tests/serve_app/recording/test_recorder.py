@@ -500,13 +500,13 @@ def test_many_open_episodes_take_bounded_memory(ur5: Path, tmp_path: Path, monke
         for i in range(1000):
             recorder.record(DecisionRecord(policy, np.zeros(27), np.zeros(6), f"e{i}", 0))
             recorder.record(OutcomeRecord(policy, f"e{i}", 0, reward=1.0))  # none ever ends
-    recording = Recording(tmp_path / "run.mcap")
-    alive: list[Episode] = []
-    count = 0
-    for episode in episodes(recording):
-        count += len(episode)
-        alive.append(episode)
-    assert count == 1000 and all(episode.reward.tolist() == [1.0] for episode in alive)
+    assembler, given_up = module.EpisodeAssembler(), []
+    for entry in Recording(tmp_path / "run.mcap").entries():
+        given_up += assembler.add(entry)
+        assert len(assembler.opened) <= 50
+    found = [*given_up, *assembler.opened.values()]
+    assert [episode.id for episode in found] == [f"e{i}" for i in range(1000)]
+    assert all(episode.reward.tolist() == [1.0] for episode in found)
 
 
 def test_long_episode_comes_in_pieces(ur5: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

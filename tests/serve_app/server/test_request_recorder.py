@@ -225,10 +225,19 @@ def test_an_observation_that_nothing_has_looked_at_may_be_anything(start: Callab
     assert entry.acted.all()
 
 
-def test_a_session_that_goes_on_begins_no_episode(
-    start: Callable[..., Server], recurrent: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_episode_is_counted_anew_when_too_many_others_came_after_it(
+    start: Callable[..., Server], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(request_recorder, "MOST_EPISODES", 1)
+    monkeypatch.setattr(request_recorder, "MOST_EPISODES", 2)
+    server = start()
+    for name in ("a", "b", "a", "c", "a", "b"):  # the one that was silent longest is b
+        assert server.act("ur5", {"obs": [0.0] * 27}, **{"x-session-id": name})[0] == 200
+    assert sorted((one.id, one.steps.tolist()) for one in server.recorded()) == [
+        ("a", [0, 1, 2]), ("b", [0]), ("b", [0]), ("c", [0]),
+    ]  # fmt: skip
+
+
+def test_a_session_that_goes_on_begins_no_episode(start: Callable[..., Server], recurrent: Path) -> None:
     server = start()
     a, b = ({"obs": [0.5, 0.25, 0.125], "session_id": name} for name in "ab")
     begin: dict[str, Any] = {"reset": True}

@@ -12,7 +12,7 @@ from rlservo.serve_app.repository import repository
 from stores import load_store
 
 
-def test_each_contract_is_read_by_one_look_and_its_own_load(
+def test_each_contract_is_read_by_one_look(
     discrete_policy: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     count = 12
@@ -27,7 +27,7 @@ def test_each_contract_is_read_by_one_look_and_its_own_load(
 
     monkeypatch.setattr(repository, "read_contract", counted)
     store = load_store(tmp_path)
-    assert len(store.names) == count and reads <= 2 * count
+    assert len(store.names) == count and reads == count
     store.close()
 
 
