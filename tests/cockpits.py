@@ -25,6 +25,7 @@ from browser import browser_program
 from bundles import write_bundle
 from rlservo.export.contract import bundle as bundle_files
 from servers import free_ports
+from waiting import PATIENCE_S, wait_for
 
 FLAGS = (
     "--no-sandbox",
@@ -48,16 +49,6 @@ CORNER_OF_SCENE = """() => {
     const scene = boxes.sort((one, other) => other.width * other.height - one.width * one.height)[0];
     return [scene.x, scene.y];
 }"""
-PATIENCE_S = float(os.environ.get("RLSERVO_PATIENCE_S", 180.0))  # a browser that draws in software on a busy machine
-
-
-def wait_for(condition: Callable[[], Any], what: str, timeout_s: float = PATIENCE_S, *, poll_s: float = 0.05) -> Any:
-    """Poll until something is true, and return it."""
-    deadline = time.monotonic() + timeout_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited {timeout_s:g} s for: {what}"
-        time.sleep(poll_s)
-    return found
 
 
 @dataclass

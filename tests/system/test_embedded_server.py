@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from rlservo.export.contract.errors import BundleError, UsageError
 from rlservo.serve_app.engines.uvicorn_server import serve_policies
 from rlservo.serve_app.runtime.policy import Policy
 from servers import Run, ask, free_ports, launched, running, wait_until_served
+from waiting import wait_for
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
 PATIENCE_S = 120  # [s] on a busy machine
@@ -146,13 +147,6 @@ def worker_pids(run: Run) -> list[int]:
     return sorted(found)
 
 
-def wait_for(condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
-
-
 @pytest.mark.serve
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -172,7 +166,7 @@ def test_a_worker_that_is_killed_or_stopped_is_replaced_under_load(
             os.kill(before[0], number)
             time.sleep(1)
         load.pause_s = 0.1  # that a worker is stopped is noticed after 30 s
-        wait_for(lambda: before[0] not in (now := worker_pids(run)) and len(now) == 2, noticed_s)
+        wait_for(lambda: before[0] not in (now := worker_pids(run)) and len(now) == 2, timeout_s=noticed_s)
         load.pause_s = Load.pause_s
         time.sleep(2)
     assert load.asked > 100 and load.wrong == 0

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from rlservo.export.contract.errors import ConflictError
 from rlservo.serve_app.client.admin_client import AdminClient
 from rlservo.serve_app.wire.admin_key_file import read_key
 from servers import Run, ask, launched
+from waiting import wait_for
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -62,15 +63,6 @@ def defaults(run: Run) -> set[str]:
     return {listing["policies"][0]["version"] for listing in listings(run).values()}
 
 
-def until(condition: Callable[[], bool], timeout_s: float = 30.0) -> float:
-    """Wait for something; return how long that took [s]."""
-    began = time.monotonic()
-    while not condition():
-        assert time.monotonic() - began < timeout_s
-        time.sleep(0.02)
-    return time.monotonic() - began
-
-
 def admin(run: Run) -> AdminClient:
     assert run.key_file is not None
     return AdminClient(f"http://127.0.0.1:{run.port}", api_key=read_key(run.key_file))
@@ -80,13 +72,13 @@ def test_every_worker_of_every_server_follows_whoever_changed_the_plan(servers: 
     assert [defaults(run) for run in servers] == [{"10"}, {"10"}]
     with admin(servers[0]) as client:
         client.alias("ur5", "production", "2")
-    until(lambda: all(defaults(run) == {"2"} for run in servers))
+    wait_for(lambda: all(defaults(run) == {"2"} for run in servers))
     done = subprocess.run(
         [*RLSERVO, "policy", "rollback", "ur5", "--repository", str(repository)],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     assert "default 10" in done.stdout and f"plan 3 in {repository}/.plan" in done.stdout
-    until(lambda: all(defaults(run) == {"10"} for run in servers))
+    wait_for(lambda: all(defaults(run) == {"10"} for run in servers))
     key_file, url = str(servers[0].key_file), f"http://127.0.0.1:{servers[0].port}"
     listed = [*RLSERVO, "policy", "list", "--json", "--url", url, "--key-file", key_file]
 
@@ -94,10 +86,10 @@ def test_every_worker_of_every_server_follows_whoever_changed_the_plan(servers: 
         said = subprocess.run(listed, capture_output=True, text=True, check=True).stdout
         return {process["replica"]: process["generation"] for process in json.loads(said)}
 
-    until(lambda: followed() == dict.fromkeys(listings(servers[0]), 3))  # workers share their metrics each second
+    wait_for(lambda: followed() == dict.fromkeys(listings(servers[0]), 3))  # workers share their metrics each second
     killed = int(next(iter(listings(servers[1]))))
     os.kill(killed, signal.SIGKILL)  # its successor comes up with the plan
-    until(lambda: str(killed) not in listings(servers[1]), 60)
+    wait_for(lambda: str(killed) not in listings(servers[1]))
     assert {each["generation"] for run in servers for each in listings(run).values()} == {3}
 
 
@@ -126,4 +118,4 @@ def test_of_operators_that_race_through_two_servers_one_wins_each_time(servers: 
     production = {plan["generation"]: plan["policies"]["ur5"]["aliases"]["production"] for plan in plans}
     assert won and all(production[generation] == version for generation, version in won)
     last = production[len(plans)]
-    until(lambda: all(defaults(run) == {last} for run in servers))
+    wait_for(lambda: all(defaults(run) == {last} for run in servers))

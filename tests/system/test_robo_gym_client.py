@@ -24,13 +24,14 @@ import numpy as np
 import pytest
 
 from bundles import SHIPPED
-from cockpits import cockpit_of, wait_for
+from cockpits import cockpit_of
 from environments import install_into
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
 from rlservo.envs.robot_server.server import RobotServer
 from rlservo.envs.robot_server.settings import URSettings
 from rlservo.envs.ur.model import BASE_HEIGHT
 from servers import HEEDING_CTRL_C, ShippedServer, free_ports
+from waiting import wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "robo_gym_client.py"

@@ -12,7 +12,7 @@ import pytest
 
 from arms import LIMITS, RunningArm
 from bundles import write_leaky_policy
-from cockpits import served_on, wait_for
+from cockpits import served_on
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.ghost import Ghost
 from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link, PolicySource, ServedPolicies
@@ -26,8 +26,7 @@ from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import over_uvicorn
 from stores import control_of, load_store
-
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
+from waiting import wait_for
 
 ENV = "rlservo/EndEffectorPositioningURSim-v0"
 FAST = 4.0

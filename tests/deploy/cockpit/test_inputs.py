@@ -19,7 +19,7 @@ import msgspec
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from cockpits import Cockpit, cockpit_of, wait_for
+from cockpits import Cockpit, cockpit_of
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.inputs import number_of, point_of
 from rlservo.deploy.cockpit.panel import DrivePanel
@@ -27,6 +27,7 @@ from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import BundledPolicies, Choice
 from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
+from waiting import wait_for
 
 pytestmark = [
     pytest.mark.slow,

@@ -18,7 +18,7 @@ from PIL import Image
 
 pytest.importorskip("viser", reason="the cockpit draws with viser")
 
-from cockpits import PATIENCE_S, TWO_FRAMES, Browser, Cockpit, Windows, cockpit_of, served_on, wait_for
+from cockpits import TWO_FRAMES, Browser, Cockpit, Windows, cockpit_of, served_on
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
@@ -29,6 +29,7 @@ from rlservo.serve_app.rollout.control_loop import rollout
 from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import control_of, load_store
+from waiting import PATIENCE_S, wait_for
 
 # In this order: each finds the drive as the one before has left it; a ghost's plot stays as long as its cycles do.
 pytestmark = [

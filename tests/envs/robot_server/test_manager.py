@@ -25,6 +25,7 @@ from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER, Emp
 from rlservo.envs.robot_server.server import CannotListenError, PortInUseError, bind
 from rlservo.serve_app.engines.ports import listen
 from servers import free_ports
+from waiting import wait_for
 
 UR = "roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur5"
 MIR = "roslaunch mir100_robot_server sim_robot_server.launch"
@@ -42,15 +43,6 @@ def is_alive(pid: int) -> bool:
             return stat.read().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
         return False
-
-
-def wait_for(condition: Callable[[], bool], seconds: float) -> bool:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def test_server_starts_answers_and_is_gone_after_the_kill(manager: ServerManager, client: Any) -> None:
@@ -126,8 +118,8 @@ def test_killed_robot_server_is_noticed_and_its_client_gets_an_error(
         for _ in range(100):  # the call that finds out may be the next one
             get_state(port)
     assert caught.value.code() == grpc.StatusCode.UNAVAILABLE
-    assert wait_for(lambda: port not in manager.servers.running, 2.0)
-    assert wait_for(lambda: "exited unexpectedly: killed by SIGKILL" in caplog.text, 2.0)
+    wait_for(lambda: port not in manager.servers.running, timeout_s=2.0)
+    wait_for(lambda: "exited unexpectedly: killed by SIGKILL" in caplog.text, timeout_s=2.0)
     assert not is_alive(pid)  # and no zombie is left
     assert get_state(other).success
     # robo-gym's ExceptionHandling wrapper kills the server it lost before it starts another.
@@ -314,7 +306,7 @@ def test_nothing_outlives_the_manager_however_it_ends(command: Any, end: signal.
     process.send_signal(end)
     process.wait(5)
     assert process.returncode == (-end if end == signal.SIGKILL else 0)
-    assert wait_for(lambda: not any(is_alive(pid) for pid in servers), 2.0)
+    wait_for(lambda: not any(is_alive(pid) for pid in servers), timeout_s=2.0)
 
 
 def test_manager_takes_the_first_free_port_of_robo_gyms_range(command: Any) -> None:
@@ -426,9 +418,9 @@ def test_robot_server_without_a_client_ends_itself_called_or_not_and_one_with_a_
             call(Empty().SerializeToString(), timeout=5)
             never_called = servers.start(UR)  # now: on a busy machine a start takes as long as a server waits
             assert count_connections(kept) == 1
-            assert wait_for(lambda: left not in servers.running, 20.0)
-            assert wait_for(lambda: never_called not in servers.running, 20.0)
+            wait_for(lambda: left not in servers.running, timeout_s=20.0)
+            wait_for(lambda: never_called not in servers.running, timeout_s=20.0)
             assert kept in servers.running
-        assert wait_for(lambda: kept not in servers.running, 20.0)
+        wait_for(lambda: kept not in servers.running, timeout_s=20.0)
     finally:
         servers.close()

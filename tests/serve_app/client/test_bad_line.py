@@ -38,8 +38,6 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.policy_store import PolicyStore
 from stores import control_of, load_store
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 ROOT = Path(__file__).resolve().parents[3]
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 KEY, LINE = new_key("robot", explore=True)
@@ -464,13 +462,8 @@ def test_a_fallback_that_is_no_action_is_refused_before_the_loop(
 def test_a_rollout_over_a_bad_line_finishes_and_counts(kind: type[Client], line: FaultyLine) -> None:
     rng = random.Random(1)
     faults = [("delay", 0.3), ("cut", 4), ("swallow", 0)]
-    with WithFallback(connected(kind, line, deadline_ms=200.0), "hold") as policy:
-        told = []
-
-        def disturb(error: Exception) -> None:
-            told.append(error)
-
-        policy._on_fallback = disturb
+    told: list[Exception] = []
+    with WithFallback(connected(kind, line, deadline_ms=200.0), "hold", on_fallback=told.append) as policy:
 
         def episode_over(_row: Any) -> None:
             line.faults.extend([("", 0.0)] * 3 + rng.choices(faults, k=5))

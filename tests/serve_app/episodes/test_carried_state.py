@@ -30,8 +30,6 @@ from rlservo.serve_app.versions.serving_plan import PolicyPlan
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from stores import control_of, store_of
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 OBS = [0.5, -0.25, 1.0]
 LIMIT = 0.05
 Serve = Callable[[Any], AbstractContextManager[int]]

@@ -28,8 +28,6 @@ from rlservo.serve_app.versions.policy_store import PolicyStore
 from servers import exchange
 from stores import control_of, load_store, store_of
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 STEPS = 12
 Ask = Callable[..., tuple[int, Any]]
 Serve = Callable[[Any], AbstractContextManager[int]]

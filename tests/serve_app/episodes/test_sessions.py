@@ -24,8 +24,6 @@ from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from stores import control_of, load_store
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 OBS = [0.5, -0.25, 1.0]
 MOST = 8
 

@@ -51,9 +51,6 @@ ADMIN, ADMIN_LINE = new_key("boss", admin=True)
 OTHER, OTHER_LINE = new_key("screen")
 LENGTH, BATCH = 8, 40  # steps of an episode, and of an update
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 
 @dataclass
 class Cell:

@@ -34,9 +34,6 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 Serve = Callable[[Any], AbstractContextManager[int]]
 Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 ROBOT, ROBOT_LINE = new_key("cell-7")
 ADMIN, ADMIN_LINE = new_key("boss", admin=True)
 WRONG, _ = new_key("nobody")

@@ -18,9 +18,6 @@ from rlservo.serve_app.protocols.pages import FOLDER
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import control_of, load_store
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 
 def test_the_page_names_no_other_host() -> None:
     page = (FOLDER / "docs.html").read_text() + (FOLDER / "docs.js").read_text()

@@ -33,8 +33,6 @@ from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import control_of, load_store
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 TYPES = {"int64": TensorProto.INT64, "uint64": TensorProto.UINT64, "uint8": TensorProto.UINT8}
 # As JSON has them, for a policy that observes two int64, two uint64 or two uint8.
 KEPT = [

@@ -20,9 +20,6 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 KEY, LINE = new_key("operator", admin=True)
 HUGE = ("1" * 310, "-" + "9" * 310, "1" * 4000, "1e999", "-1e999", "NaN", "1" + "0" * 400 + ".5")
 OBS = [0.1] * 27

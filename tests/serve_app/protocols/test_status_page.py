@@ -33,9 +33,6 @@ from stores import control_of, load_store
 Serve = Callable[[Any], AbstractContextManager[int]]
 Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 CHROMIUM = "text/html,application/xhtml+xml,application/xml;q=0.9,image/avif,image/webp,*/*;q=0.8"
 PAGE = {"accept": CHROMIUM}
 OPERATOR, OPERATOR_LINE = new_key("operator", admin=True)

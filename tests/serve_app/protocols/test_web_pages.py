@@ -26,9 +26,6 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 Serve = Callable[[Any], AbstractContextManager[int]]
 Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 SESSION = "robot-7"
 ACT = {"obs": [0.1, 0.2, 0.3], "session_id": SESSION}
 INFER = {

@@ -30,9 +30,6 @@ from stores import control_of, load_store
 OBS = (np.arange(27) * 0.01).astype(np.float32)
 ARRAY = b"__ndarray__"
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 
 def pack_array(value: Any) -> Any:
     if isinstance(value, np.ndarray):

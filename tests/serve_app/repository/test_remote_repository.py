@@ -50,6 +50,7 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan, ServedConfig
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from storages import ENDLESS, MOST_SENT, SECRET, Cut, Drip, Lie, Storage, late, only
+from waiting import until
 
 AWAY = "(cannot be reached or read|gave no answer)"
 FILES = ("SHA256SUMS", "contract.json", "golden.npz", "policy.onnx", "policy.ts")
@@ -103,13 +104,6 @@ def fetch(repository: Repository, version: str = "1") -> Path:
 
 def digest_of(made: Path, version: str) -> str:
     return load_bundle(made / "ur5" / version).digest
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        await asyncio.sleep(0.02)
 
 
 def test_a_published_version_is_found_fetched_once_and_proven(made: Path, storage: Storage, cache: Path) -> None:

@@ -28,9 +28,6 @@ from stores import control_of, load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 CELL, CELL_LINE = new_key("cell-7")
 OTHER, OTHER_LINE = new_key("cell-8")
 EXPLORER, EXPLORER_LINE = new_key("trainee", explore=True)

@@ -30,8 +30,6 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
 from stores import control_of, load_store
 
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 ROWS = 64
 MANY = 300_000
 LISTS = ",".join(["[]"] * MANY)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-import pytest
 import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
@@ -20,9 +19,6 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import Load, Unload
 from servers import exchange
 from stores import control_of, load_store
-
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 
 OBS = [0.1] * 27
 

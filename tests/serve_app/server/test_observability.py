@@ -149,7 +149,6 @@ def test_the_log_says_what_happened_and_values_only_when_asked(
     assert str(SECRET)[:6] not in text or values
 
 
-@pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
 def test_requests_on_streams_are_logged_like_others(
     ur5: Path, served: Callable[[Any], AbstractContextManager[int]], log_file: Path
 ) -> None:

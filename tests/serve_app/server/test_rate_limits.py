@@ -33,9 +33,6 @@ from stores import control_of, load_store
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 OBS = [0.1] * 27
 BURST = 3
 LIMITED, LIMITED_LINE = new_key("cell-7", rate=0.001, burst=BURST)  # in a test's time no further one

@@ -25,9 +25,6 @@ from rlservo.serve_app.server.request_handler import Admission
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import control_of, load_store
 
-# uvicorn 0.54 picks a protocol that it itself calls deprecated; Ray Serve leaves the choice to it.
-pytestmark = pytest.mark.filterwarnings("ignore:The `websockets` implementation:DeprecationWarning")
-
 OBS = np.random.default_rng(8).standard_normal((4096, 27)).astype(np.float32)
 Serve = Callable[..., AbstractContextManager[int]]
 

@@ -30,6 +30,7 @@ from rlservo.serve_app.versions.plan_files import FOLDER, PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.serving_plan import Plan
 from rlservo.serve_app.versions.version_loader import VersionLoader
+from waiting import until
 
 OBS = np.zeros(27, np.float32) + 0.1
 
@@ -81,14 +82,6 @@ def folder(policies: Path, tmp_path: Path) -> Path:
 
 def break_weights(folder: Path, version: str) -> None:
     (folder / "ur5" / version / "policy.onnx").write_bytes(b"nothing")
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    for _ in range(1000):
-        if condition():
-            return
-        await asyncio.sleep(0.02)
-    pytest.fail("it did not come about within 20 s")
 
 
 def test_a_change_is_served_by_who_took_it_when_it_answers_and_by_the_others_within_a_second(folder: Path) -> None:
