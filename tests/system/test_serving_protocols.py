@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 from pathlib import Path
-from typing import Any
 
 import msgpack
 import numpy as np
@@ -13,38 +11,22 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.engines.uvicorn_server import serve_policies
 from rlservo.serve_app.runtime.policy import Policy
-from servers import LiveServer, free_ports
+from servers import LiveServer, ask, exchange
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
 BATCH = np.random.default_rng(3).standard_normal((1024, 27)).astype(np.float32)
 
 
-def call(
-    server: LiveServer, method: str, path: str, body: bytes | None = None, **headers: str
-) -> tuple[int, Any, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
-    sent = {"authorization": server.bearer} | {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, body, sent)
-    reply = connection.getresponse()
-    content = reply.read()
-    connection.close()
-    return reply.status, reply.headers, content
-
-
 def test_a_batch_of_1024_goes_through_as_binary_tensors(live_server: LiveServer, ur5: Path) -> None:
     tensor = {"name": "obs", "shape": [1024, 27], "datatype": "FP32", "parameters": {"binary_data_size": BATCH.nbytes}}
     header = json.dumps({"inputs": [tensor], "parameters": {"binary_data_output": True}}).encode()
-    status, headers, reply = call(
-        live_server,
-        "POST",
-        "/v2/models/ur5/infer",
-        header + BATCH.tobytes(),
+    status, headers, reply = exchange(
+        live_server.port, "POST", "/v2/models/ur5/infer", header + BATCH.tobytes(),
+        authorization=live_server.bearer, content_type="application/octet-stream",
         inference_header_content_length=str(len(header)),
-    )
+    )  # fmt: skip
     assert status == 200
     action = np.frombuffer(reply[int(headers["inference-header-content-length"]) :], "<f4").reshape(1024, 6)
     with Policy.load(ur5) as policy:
@@ -74,8 +56,8 @@ def test_a_stream_is_answered(live_server: LiveServer, ur5: Path) -> None:
 
 def test_without_a_key_nothing_gets_through(live_server: LiveServer) -> None:
     for method, path in (("GET", "/v1/policies"), ("POST", "/v1/policies/ur5/act"), ("POST", "/v2/models/ur5/infer")):
-        status, _, reply = call(live_server, method, path, b"{}", authorization="Bearer nobody")
-        assert (status, json.loads(reply)["code"]) == (401, "unauthenticated")
+        status, reply = ask(live_server.port, method, path, {}, "nobody")
+        assert (status, reply["code"]) == (401, "unauthenticated")
     with pytest.raises(InvalidStatus) as caught:
         websockets.sync.client.connect(f"ws://127.0.0.1:{live_server.port}/").__enter__()
     assert caught.value.response.status_code == 401
@@ -83,19 +65,7 @@ def test_without_a_key_nothing_gets_through(live_server: LiveServer) -> None:
 
 
 def test_prometheus_reads_what_the_replica_answered(live_server: LiveServer) -> None:
-    call(
-        live_server,
-        "POST",
-        "/v1/policies/ur5/act",
-        json.dumps({"obs": BATCH[0].tolist()}).encode(),
-        content_type="application/json",
-    )
-    status, headers, text = call(live_server, "GET", "/metrics")
+    ask(live_server.port, "POST", "/v1/policies/ur5/act", {"obs": BATCH[0].tolist()}, live_server.key)
+    status, headers, text = exchange(live_server.port, "GET", "/metrics", authorization=live_server.bearer)
     assert status == 200 and headers["content-type"].startswith("text/plain")
     assert b'rlservo_requests_total{code="ok",policy="ur5",protocol="json",replica="' in text
-
-
-def test_a_server_beyond_this_machine_without_keys_is_refused_before_anything_starts(policies: Path) -> None:
-    (port,) = free_ports(1)
-    with pytest.raises(UsageError, match="without API keys"):
-        serve_policies([policies], host="0.0.0.0", port=port)

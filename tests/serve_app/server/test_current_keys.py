@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import http.client
 import json
 import logging
 import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 
 import msgpack
@@ -23,7 +21,7 @@ from rlservo.serve_app.server import current_keys
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.current_keys import CurrentKeys
 from rlservo.serve_app.server.settings import ServerSettings
-from servers import served_in_thread
+from servers import ask, served_in_thread
 from waiting import wait_for
 
 OLD, OLD_LINE = new_key("cell-7")
@@ -32,15 +30,7 @@ OBS = [0.1] * 27
 
 
 def status(port: int, key: str) -> int:
-    return ask(port, key, "POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS}))[0]
-
-
-def ask(port: int, key: str, method: str, path: str, body: str | None = None) -> tuple[int, bytes]:
-    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
-        headers = {"content-type": "application/json", "authorization": f"Bearer {key}"}
-        connection.request(method, path, body, headers)
-        reply = connection.getresponse()
-        return reply.status, reply.read()
+    return ask(port, "POST", "/v1/policies/ur5/act", {"obs": OBS}, key)[0]
 
 
 @pytest.fixture
@@ -187,7 +177,7 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
         return OLD_LINE.encode()
 
     def are_current(value: bytes) -> bool:
-        return b'rlservo_api_keys_current{replica=""} %s.0\n' % value in ask(port, OLD, "GET", "/metrics")[1]
+        return b'rlservo_api_keys_current{replica=""} %s.0\n' % value in ask(port, "GET", "/metrics", key=OLD)[1]
 
     monkeypatch.setattr(current_keys, "READ_S", 0.1)
     with served_in_thread([ur5], settings={"api_keys_file": str(file)}) as port:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import http.client
 import json
 import logging
 import re
@@ -60,10 +59,7 @@ def post(port: int, path: str, body: Any, **headers: str) -> tuple[int, bytes]:
 
 
 def scrape(port: int) -> dict[tuple[str, ...], float]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("GET", "/metrics")
-    text = connection.getresponse().read().decode()
-    connection.close()
+    text = exchange(port, "GET", "/metrics").content.decode()
     return {
         (sample.name, *(value for key, value in sorted(sample.labels.items()) if key != "replica")): sample.value
         for family in text_string_to_metric_families(text)
@@ -202,10 +198,7 @@ def test_the_dashboard_asks_for_metrics_that_exist(
         assert post(port, "/v1/policies/ur5/act", end)[0] == 200
         # These need a stream and an administered server.
         exposed = {name for name, *_ in scrape(port)} | {"rlservo_streams", "rlservo_plan_generation"}
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-        connection.request("GET", "/metrics")
-        labels = set(re.findall(r"(\w+)=\"", connection.getresponse().read().decode()))
-        connection.close()
+        labels = set(re.findall(r"(\w+)=\"", exchange(port, "GET", "/metrics").content.decode()))
     dashboard = json.loads(DASHBOARD.read_text())
     queries = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", ())]
     assert len(queries) >= 8
