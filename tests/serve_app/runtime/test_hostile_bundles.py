@@ -48,9 +48,11 @@ from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.plan_commands import Load, SetAlias
 from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.serving_plan import ServedConfig
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from stores import plan_files
+from waiting import until
 
 Serve = Callable[[Any], AbstractContextManager[int]]
 
@@ -403,22 +405,22 @@ def test_a_process_whose_files_hang_follows_what_others_change_meanwhile(
         for control in controls:
             await control.configure(config)
         stalled = stall(elsewhere / "ur5" / "2" / "policy.onnx")
+
+        def served() -> PolicyStore:
+            assert controls[1].store is not None
+            return controls[1].store
+
         watching = asyncio.create_task(
             repeat(controls[1].files.poll_s, controls[1].follow, "the plan cannot be followed")
         )
         await controls[0].give(Load(version="2"), "ur5")
-        await asyncio.sleep(1.5)
+        await until(lambda: controls[1].behind)
         assert controls[1].behind[0].startswith("loading policy 'ur5' version 2 took longer than 1 s")
         for number in range(5):  # of the other policy
             await controls[0].give(SetAlias(alias=f"alias{number}", version="1"), "gridworld")
-            await asyncio.sleep(0.5)
-            served = controls[1].store
-            assert served is not None and f"alias{number}" in served.plans["gridworld"].aliases
+            await until(lambda: f"alias{number}" in served().plans["gridworld"].aliases)  # noqa: B023 - awaited here
         stalled.go_on.set()
-        for _ in range(200):
-            if controls[1].store is not None and controls[1].store.versions("ur5") == ("1", "2"):
-                break
-            await asyncio.sleep(0.05)
+        await until(lambda: served().versions("ur5") == ("1", "2"))
         watching.cancel()
         assert controls[1].behind == ()
 
