@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -83,6 +84,11 @@ LONGEST = (
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
     "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_current_keys.py",
 )  # fmt: skip
+
+for name in {*TOGETHER, *LONGEST} - {*TOGETHER.values()}:
+    assert Path(__file__).parents[1].joinpath(name.partition("::")[0]).exists(), (
+        f"{name} is in a table, and is not there"
+    )
 
 # Servers and Rays that tests share. An unused one still takes a tenth of a core or more.
 RUNNING = {"live_server", "shipped_server", "cluster", "one_ray"}

@@ -61,14 +61,6 @@ def last(env: Mir100Navigation, action: np.ndarray) -> tuple[Any, ...]:
 # -- Gymnasium, RLlib
 
 
-@pytest.mark.parametrize("env_id", BOTH)
-def test_gym_make_finds_it_in_a_fresh_process_by_the_module_before_its_id(env_id: str) -> None:
-    made = f"rlservo.envs:{env_id}"
-    code = f"import gymnasium as gym; env = gym.make({made!r}); env.reset(seed=0); print(env.spec.id)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.stdout.strip() == env_id, done.stderr
-
-
 @pytest.mark.filterwarnings("ignore:.*A Box observation space (minimum|maximum) value is:UserWarning")
 @pytest.mark.parametrize("env_id", BOTH)
 def test_gymnasium_check_env_passes(env_id: str) -> None:

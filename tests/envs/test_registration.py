@@ -36,6 +36,7 @@ def test_what_does_not_use_the_environments_does_not_import_them() -> None:
 
 
 def test_an_environment_named_with_its_module_has_the_plain_id_afterwards() -> None:
-    code = f"import gymnasium; print(gymnasium.make('{ID}').spec.id)"
+    names = [f"rlservo/{name}-v0" for name in ("NoObstacleNavigationMir100Sim", "EndEffectorPositioningURSim")]
+    code = f"import gymnasium; [print(gymnasium.make('rlservo.envs:' + name).spec.id) for name in {names}]"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.stdout == "rlservo/NoObstacleNavigationMir100Sim-v0\n", done.stderr
+    assert done.stdout.splitlines() == names, done.stderr

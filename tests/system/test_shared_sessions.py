@@ -6,10 +6,10 @@ import asyncio
 from pathlib import Path
 
 import pytest
-from robots import MODEL, GrpcConnection, HttpConnection, Tally, play
 
 from clusters import KEY, RECURRENT, Cluster
 from servers import launched
+from session_players import MODEL, GrpcConnection, HttpConnection, Tally, play
 from storages import RedisServer
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

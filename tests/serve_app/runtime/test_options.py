@@ -184,10 +184,3 @@ def test_lists_of_numbers_become_what_numpy_makes_of_them(dtype: str, monkeypatc
         assert repr(results[0]) == repr(results[1]), obs
         taken += quick._pack(obs) is not None
     assert taken > 500
-
-
-def test_integer_boxes_of_their_dtypes_own_range_need_no_look() -> None:
-    image = LeafParser("p", BoxSpec(shape=(4, 4), dtype="uint8", low=0, high=255))
-    assert not image._bounded
-    narrow = LeafParser("p", BoxSpec(shape=(2,), dtype="int64", low=-5, high=200), options=PolicyOptions())
-    assert narrow._bounded
