@@ -116,8 +116,8 @@ class PlanFollower:
         try:
             if isinstance(command, Load):
                 command = Load.of(*(await self.loader.look()).find(name, command.version))
+            known = 0 if self.plan is None else self.plan.generation  # before the look: later ones need not be in it
             before = await self.files.call(self.files.newest)
-            known = 0 if self.plan is None else self.plan.generation
             if (0 if before is None else before.generation) < known:
                 raise UnavailableError(f"{self.files.place} has lost plan {known}, which is served here")
             return await self._write(before or await self._unwritten(), command, name)

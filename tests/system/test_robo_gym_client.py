@@ -234,7 +234,7 @@ class SlowToStart(RobotServers):
 
     def start(self, line: str, *, gui: bool = False) -> int:
         self.starts += 1
-        time.sleep(3.0)
+        time.sleep(1.5)
         return super().start(line, gui=gui)
 
 

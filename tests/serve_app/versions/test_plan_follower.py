@@ -177,6 +177,33 @@ def test_changes_of_different_things_at_once_are_all_made(folder: Path, tmp_path
     asyncio.run(run())
 
 
+def test_a_command_that_another_overtakes_while_it_looks_is_carried_out(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def run() -> None:
+        fleet = Fleet(folder, folder)
+        await fleet.deploy({})
+        (control,) = fleet.controls
+        looked, go_on, newest = threading.Event(), threading.Event(), control.files.newest
+
+        def slow() -> Plan | None:
+            plan = newest()
+            if not looked.is_set():
+                looked.set()
+                assert go_on.wait(20)
+            return plan
+
+        monkeypatch.setattr(control.files, "newest", slow)
+        overtaken = asyncio.create_task(control.give(aliasing("1", "candidate"), "ur5"))
+        await until(looked.is_set)
+        await control.give(SetShadow(version="2"), "ur5")
+        go_on.set()
+        ur5 = (await overtaken).policies["ur5"]
+        assert (ur5.aliases["candidate"], ur5.shadow) == ("1", "2")
+
+    asyncio.run(run())
+
+
 def test_a_version_that_fails_is_refused_before_anything_is_written(folder: Path) -> None:
     async def run() -> None:
         fleet = Fleet(folder, folder)
