@@ -42,7 +42,7 @@ def test_both_clocks_give_the_same_ur_trajectory_and_only_one_takes_its_time(ser
         seconds[clock] = time.monotonic() - began
         runs[clock] = states
     assert runs["fast"] == runs["real"]
-    assert 1.45 < seconds["real"] < 3.0  # a busy machine is late; the rate itself is tested below
+    assert seconds["real"] > 1.45  # by how much a busy machine is late says nothing; the rate itself is tested below
     assert seconds["fast"] < seconds["real"] / 2
 
 
@@ -60,7 +60,7 @@ def test_both_clocks_give_the_same_mir100_trajectory(serve: Serve) -> None:
         seconds[clock] = time.monotonic() - began
         runs[clock] = states
     assert runs["fast"] == runs["real"]
-    assert 0.95 < seconds["real"] < 2.0
+    assert seconds["real"] > 0.95
 
 
 def test_setstate_takes_its_cycles_in_real_time(serve: Serve) -> None:
