@@ -12,7 +12,7 @@ PATIENCE_S = float(os.environ.get("RLSERVO_PATIENCE_S", 180.0))  # a browser tha
 
 
 def wait_for(
-    condition: Callable[[], Any], what: str = "a condition", timeout_s: float = PATIENCE_S, *, poll_s: float = 0.02
+    condition: Callable[[], Any], what: str = "a condition", timeout_s: float = PATIENCE_S, *, poll_s: float = 0.05
 ) -> Any:
     """Poll until something is true, and return it."""
     deadline = time.monotonic() + timeout_s

@@ -166,7 +166,7 @@ def test_a_worker_that_is_killed_or_stopped_is_replaced_under_load(
             os.kill(before[0], number)
             time.sleep(1)
         load.pause_s = 0.1  # that a worker is stopped is noticed after 30 s
-        wait_for(lambda: before[0] not in (now := worker_pids(run)) and len(now) == 2, timeout_s=noticed_s)
+        wait_for(lambda: before[0] not in (now := worker_pids(run)) and len(now) == 2, timeout_s=noticed_s, poll_s=0.2)
         load.pause_s = Load.pause_s
         time.sleep(2)
     assert load.asked > 100 and load.wrong == 0
@@ -183,7 +183,7 @@ def test_sighup_replaces_every_worker_and_no_request_fails(workers: tuple[Run, L
     with load.run():
         time.sleep(1)
         run.process.send_signal(signal.SIGHUP)
-        wait_for(lambda: not set(before) & set(now := worker_pids(run)) and len(now) == 2)
+        wait_for(lambda: not set(before) & set(now := worker_pids(run)) and len(now) == 2, poll_s=0.2)
         time.sleep(1)
     assert load.asked > 100 and (load.wrong, load.failures) == (0, [])
 
