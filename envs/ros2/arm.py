@@ -198,7 +198,8 @@ class RosArmConnection:
         if address["status"] == "on":
             self._modes.clear()
             link.subscribe(address["speed_scaling"], NUMBER, self._take_speed)
-            for name, own in (("program_running", FLAG), ("robot_mode", ""), ("safety_mode", "")):
+            # The order in which the driver publishes them: the program is seen to end after what ended it.
+            for name, own in (("robot_mode", ""), ("safety_mode", ""), ("program_running", FLAG)):
                 topic = address[name]
                 wait_until(
                     lambda topic=topic: bool(link.publishers(topic)),  # type: ignore[misc]  # a default is no argument

@@ -86,9 +86,9 @@ class SimulatedArm:
         if controller.time_s >= self._status_due_s:
             self._status_due_s = controller.time_s + STATUS_PERIOD_S
             self._publish["speed_scaling"]({"data": 100.0 * controller.speed_fraction})
-            self._publish["program_running"]({"data": self._has_program})
             self._publish["robot_mode"]({self._mode_field: int(controller.robot_mode)})
             self._publish["safety_mode"]({self._mode_field: int(controller.safety_mode)})
+            self._publish["program_running"]({"data": self._has_program})  # last, as the driver
 
     def obey(self, line: str) -> str:
         """Carry out a line of the controller's console."""

@@ -178,12 +178,13 @@ def test_stopped_robot_does_not_move_again_before_a_new_target(ros: Ros, sim: Pr
     get_moving(ros)
     seen = len(node.lines)  # of the tests before, which share the node
     sim.type("protective")
-    node.wait_for("fault: protective_stop", after=seen)
-    seen = len(node.lines)
-    ros.give_target(*place(0.0))
-    ros.wait_until(lambda: ros.heartbeat()["message"].startswith("fault: protective_stop"))
-    sim.type("unlock")
-    ros.wait_until(lambda: (sim.type("unlock"), ros.ask("call", service=RESEND)["success"])[1])
+    try:
+        node.wait_for("fault: protective_stop", after=seen)
+        seen = len(node.lines)
+        ros.give_target(*place(0.0))
+        ros.wait_until(lambda: ros.heartbeat()["message"].startswith("fault: protective_stop"))
+    finally:
+        ros.wait_until(lambda: (sim.type("unlock"), ros.ask("call", service=RESEND)["success"])[1])
     assert not [line for line in node.lines[seen:] if "ready" in line]
     get_moving(ros)
 
