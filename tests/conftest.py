@@ -39,6 +39,11 @@ pytest_plugins = [
 
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {
+    # One after the other: each takes little of a core, and next to each other they leave the others no work to do.
+    "tests/deploy/ros2/": "robots in real time",
+    "tests/envs/robots/": "robots in real time",
+    "tests/envs/ros2/": "robots in real time",
+    "tests/envs/ur_controller/": "robots in real time",
     "tests/envs/robot_server/": "ports of server managers",
     "tests/export/graph/test_operators.py": "torch's compiler",  # imports it
     "tests/export/sources/test_leapp.py": "torch's compiler",
@@ -69,17 +74,17 @@ TOGETHER = {
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
-# The longest files begin first, and those that mostly wait early, next to those that compute: none is left for the end.
-# The files with slow tests follow, then the rest.
+# The longest files begin first, those that mostly wait next to those that compute: none is left for the end. Of those
+# that need the same checkpoints one begins; the others come when they are trained.
 LONGEST = (
-    "live server", "one Ray", "cluster", "shipped server", "tests/test_python_versions.py",
-    "tests/serve_app/repository/test_remote_repository.py", "ports of server managers",
-    "tests/deploy/cockpit/test_page.py", "tests/system/test_documents_run.py",
-    "tests/examples/test_on_a_cluster.py", "tests/system/test_demo.py",
-    "tests/system/test_embedded_server.py", "sweep",
-    "tests/export/rllib/test_new_stack.py", "several nodes",
-    "tests/serve_app/client/test_bad_line.py",
-    "tests/system/test_remote_repository.py",
+    "robots in real time", "live server", "one Ray", "tests/system/test_documents_run.py",
+    "tests/export/proof/test_exploration.py", "ports of server managers", "cluster", "shipped server",
+    "tests/test_python_versions.py", "tests/serve_app/repository/test_remote_repository.py",
+    "tests/deploy/cockpit/test_page.py", "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py",
+    "tests/system/test_embedded_server.py", "tests/export/rllib/test_new_stack.py",
+    "tests/serve_app/client/test_bad_line.py", "sweep", "tests/serve_app/learning/test_online_learning.py",
+    "tests/export/rllib/test_filter_statistics.py", "several nodes", "tests/export/rllib/test_reported.py",
+    "tests/system/test_remote_repository.py", "torch's compiler",
     # of `make quick`
     "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
     "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_current_keys.py",
