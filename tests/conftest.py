@@ -21,6 +21,13 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Read when they are imported, in children too.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# gRPC's handlers of a fork end some children before their program begins, such as a video's ffmpeg (grpcio 1.85).
+os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
+
+# Linux shares the cores among sessions: in one, pytest's processes together got as much of them as one server of a
+# test's, and the simulated robots in them stood still.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.setsid()
 
 pytest_plugins = [
     "servers",  # which others import, as the next
