@@ -159,7 +159,10 @@ def measure(
             clock = Clock(algorithm)
             clock.iteration()  # the first one warms up
             for _ in range(iterations):
-                taken.append(clock.iteration())
+                one = clock.iteration()
+                if time_limit.up:  # what caught TimeUp went on
+                    break
+                taken.append(one)
     except Exception as error:  # Ray's and the environment's own: the other configurations are still worth measuring
         if not time_limit.up:  # Ray's `wait` makes a SystemError of TimeUp
             return Failed(runners, envs, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")
