@@ -85,7 +85,7 @@ TOGETHER = {
 # that need the same checkpoints one begins; the others come when they are trained.
 LONGEST = (
     "robots in real time", "live server", "one Ray", "tests/system/test_documents_run.py",
-    "tests/export/proof/test_exploration.py", "ports of server managers", "cluster", "shipped server",
+    "ports of server managers", "tests/export/proof/test_exploration.py", "cluster", "shipped server",
     "tests/test_python_versions.py", "tests/serve_app/repository/test_remote_repository.py",
     "tests/deploy/cockpit/test_page.py", "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py",
     "tests/system/test_embedded_server.py", "tests/export/rllib/test_new_stack.py",
