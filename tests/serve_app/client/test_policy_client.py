@@ -58,21 +58,21 @@ class Served:
         self.store = store
         app = create_app(control_of(lambda: self.store), ServerSettings())
         config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="warning", ws="none", lifespan="off")
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run)
+        self.uvicorn = uvicorn.Server(config)
+        self._thread = threading.Thread(target=self.uvicorn.run)
 
     def __enter__(self) -> Served:
         self._thread.start()
         deadline = time.monotonic() + 20
-        while not self._server.started:
+        while not self.uvicorn.started:
             assert time.monotonic() < deadline, "uvicorn did not start"
             time.sleep(0.01)
-        port = self._server.servers[0].sockets[0].getsockname()[1]
+        port = self.uvicorn.servers[0].sockets[0].getsockname()[1]
         self.url = f"http://127.0.0.1:{port}"
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.should_exit = True
+        self.uvicorn.should_exit = True
         self._thread.join()
 
 
@@ -221,7 +221,7 @@ def test_a_wrong_address_path_says_where_things_are(served: Served) -> None:
 def test_a_connection_that_idled_out_is_reopened_without_a_word(policies: Path) -> None:
     store = load_store(policies / "ur5" / "2")
     with Served(store) as server, PolicyClient(server.url, "ur5") as client:
-        server._server.config.timeout_keep_alive = 0  # uvicorn closes idle connections at once
+        server.uvicorn.config.timeout_keep_alive = 0  # uvicorn closes idle connections at once
         first = client.act(np.zeros(27))
         time.sleep(0.2)
         assert np.array_equal(client.act(np.zeros(27)), first)

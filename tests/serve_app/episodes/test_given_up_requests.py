@@ -104,13 +104,13 @@ class Client:
     """A client with one connection, which stays open."""
 
     def __init__(self, port: int) -> None:
-        self._connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+        self.connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
 
     def send(self, path: str, body: bytes) -> None:
-        self._connection.request("POST", path, body, {"content-type": "application/json"})
+        self.connection.request("POST", path, body, {"content-type": "application/json"})
 
     def receive(self) -> tuple[int, Any]:
-        reply = self._connection.getresponse()
+        reply = self.connection.getresponse()
         document = json.loads(reply.read())
         if "outputs" in document:
             document["action"] = document["outputs"][0]["data"]
@@ -125,7 +125,7 @@ class Client:
 @pytest.fixture
 def client(server: Server) -> Iterator[Client]:
     client = Client(server.port)
-    with contextlib.closing(client._connection):
+    with contextlib.closing(client.connection):
         yield client
 
 

@@ -13,6 +13,7 @@ from rlservo.serve_app.learning import following
 from rlservo.serve_app.learning.following import Ended, FollowedRecordings
 from rlservo.serve_app.recording.recorded_policy import WithRecording
 from rlservo.serve_app.recording.recorder import Recorder
+from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
 from rlservo.serve_app.runtime.policy import Policy
 
 OBS = np.zeros(27, np.float32)
@@ -23,6 +24,14 @@ def act(policy: WithRecording, steps: int, *, ends: bool) -> None:
         policy.act(OBS, explore=True)
         last = ends and step == steps - 1
         policy.outcome(1.0, terminated=last, final_obs=OBS if last else None)
+
+
+def record_cell(recorder: Recorder, ur5: Path) -> None:
+    """Record two decisions of a robot that always has this id."""
+    policy = recorder.policy(Policy.load(ur5).contract)
+    for step, last in enumerate((False, True)):
+        recorder.record(DecisionRecord(policy, OBS, np.zeros(6), "cell", step))
+        recorder.record(OutcomeRecord(policy, "cell", step, 1.0, terminated=last, final_obs=OBS if last else None))
 
 
 @pytest.fixture
@@ -59,9 +68,7 @@ def test_an_episode_comes_once_as_soon_as_it_has_ended(ur5: Path, tmp_path: Path
 def test_robots_that_use_an_id_again_have_episodes_of_their_own(ur5: Path, tmp_path: Path, said: list[str]) -> None:
     with Recorder(tmp_path) as one, Recorder(tmp_path) as other:  # two servers, one folder
         for recorder in (one, other, one):
-            with WithRecording(Policy.load(ur5), recorder) as policy:
-                policy._episode = "cell"
-                act(policy, 2, ends=True)
+            record_cell(recorder, ur5)
     found = polled(FollowedRecordings([tmp_path], said.append), 3)
     assert len(found) == 3 == len({(each.file, each.key) for each in found})
     assert [each.episode.gap for each in found] == [None] * 3
@@ -98,9 +105,8 @@ def test_the_clocks_of_servers_may_be_apart(
     for folder, days in zip(folders, (-3, 0, 400), strict=True):
         with monkeypatch.context() as patched:
             patched.setattr(time, "time_ns", lambda days=days: now() + days * 86_400_000_000_000)
-            with Recorder(folder) as recorder, WithRecording(Policy.load(ur5), recorder) as policy:
-                policy._episode = "cell"
-                act(policy, 2, ends=True)
+            with Recorder(folder) as recorder:
+                record_cell(recorder, ur5)
     found = polled(FollowedRecordings(folders, said.append), 3)
     assert [len(each.episode) for each in found] == [2] * 3 and len({each.key for each in found}) == 3
     assert [each.episode.gap for each in found] == [None] * 3 and said == []

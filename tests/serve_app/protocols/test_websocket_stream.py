@@ -56,15 +56,15 @@ class OpenpiClient:
         self._connection = websockets.sync.client.connect(
             f"ws://127.0.0.1:{port}{path}", compression=None, max_size=None, additional_headers=headers
         )
-        self._socket = self._connection.__enter__()
-        self.metadata = unpack(self._socket.recv())
+        self.socket = self._connection.__enter__()
+        self.metadata = unpack(self.socket.recv())
 
     def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
         return self.exchange(pack(obs))
 
     def exchange(self, content: bytes | str) -> dict[str, Any]:
-        self._socket.send(content)
-        response = self._socket.recv()
+        self.socket.send(content)
+        response = self.socket.recv()
         if isinstance(response, str):
             raise RuntimeError(response)
         reply: dict[str, Any] = unpack(response)
@@ -72,8 +72,8 @@ class OpenpiClient:
 
     def close_code(self) -> int | None:
         with pytest.raises(ConnectionClosed):
-            self._socket.recv()
-        return self._socket.close_code
+            self.socket.recv()
+        return self.socket.close_code
 
     def __enter__(self) -> OpenpiClient:
         return self
@@ -312,9 +312,9 @@ def test_many_robots_stream_at_once_and_none_gets_anothers_action(port: int, sto
     clients = [OpenpiClient(port) for _ in range(20)]
     for _ in range(5):
         for index, client in enumerate(clients):
-            client._socket.send(pack({"obs": OBS * index, "seq": index}))
+            client.socket.send(pack({"obs": OBS * index, "seq": index}))
         for index, client in enumerate(clients):
-            reply = unpack(client._socket.recv())
+            reply = unpack(client.socket.recv())
             assert reply["seq"] == index
             np.testing.assert_array_equal(reply["actions"][0], expected(store, OBS * index))
     for client in clients:

@@ -387,15 +387,22 @@ def test_two_writers_of_one_folder_do_not_meet(ur5: Path, tmp_path: Path) -> Non
     assert sorted((episode.id, len(episode)) for episode in episodes(Recording(tmp_path))) == [("one", 10), ("two", 10)]
 
 
-def test_file_being_written_is_not_deleted_by_another_writer(ur5: Path, tmp_path: Path) -> None:
+def test_file_being_written_is_not_deleted_by_another_writer(ur5: Path, tmp_path: Path, rng: Rng) -> None:
     contract = Policy.load(ur5).contract
+
+    def fill_folder() -> None:
+        with Recorder(tmp_path, max_file_bytes=MIB, max_folder_bytes=2 * MIB, wait=True) as other:
+            policy = other.policy(contract)
+            for step in range(25_000):
+                other.record(DecisionRecord(policy, rng.standard_normal(27), rng.uniform(-1, 1, 6), "e", step))
+
     with Recorder(tmp_path) as first:
         first.record(DecisionRecord(first.policy(contract), np.zeros(27), np.zeros(6)))
         wait_for(lambda: first.written == 1)
         (file,) = tmp_path.iterdir()
-        recorder_module._delete_oldest(tmp_path, 0)
+        fill_folder()
         assert file.exists()
-    recorder_module._delete_oldest(tmp_path, 0)
+    fill_folder()
     assert not file.exists()
 
 

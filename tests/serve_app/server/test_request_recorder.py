@@ -21,7 +21,6 @@ from rlservo.export.contract.errors import UsageError
 from rlservo.export.contract.spaces import DiscreteSpec
 from rlservo.serve_app.client.policy_client import PolicyClient
 from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.recording.episodes import Episode, episodes
 from rlservo.serve_app.recording.reader import Recording
@@ -324,15 +323,15 @@ def test_a_fault_of_the_recorder_costs_no_request_and_one_line(
     start: Callable[..., Server], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     server = start()
+    recorder = server.recorder.recorder
+    write = recorder.record
 
-    place = server.recorder._place
-
-    def fail(request: Request, *rest: Any) -> Any:
-        if request.seq == 1:
+    def fail(record: Any) -> None:
+        if record.seq == 1:
             raise KeyError("a fault")
-        return place(request, *rest)
+        write(record)
 
-    monkeypatch.setattr(server.recorder, "_place", fail)
+    monkeypatch.setattr(recorder, "record", fail)
     for seq in (1, 1, 1, 2):
         assert server.act("ur5", {"obs": [0] * 27, "seq": seq})[0] == 200
     (episode,) = server.recorded()

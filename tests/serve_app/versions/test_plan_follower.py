@@ -8,6 +8,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,19 @@ class Fleet:
     async def follow(self) -> None:
         for control in self.controls:
             await control.follow()
+
+    def look_together(self) -> None:
+        """Let the next command of each process look at the plan before any of them writes."""
+        have_looked = threading.Barrier(len(self.controls), timeout=20)
+
+        def look(files: PlanFiles) -> Plan | None:
+            del files.newest  # the next looks are its own
+            plan = files.newest()
+            have_looked.wait()
+            return plan
+
+        for control in self.controls:
+            control.files.newest = partial(look, control.files)  # type: ignore[method-assign]
 
     def defaults(self) -> list[str]:
         return [control.store.default("ur5") if control.store else "" for control in self.controls]
@@ -120,6 +134,7 @@ def test_of_two_operators_at_once_one_wins_and_the_other_is_told(folder: Path, t
     async def run() -> None:
         fleet = Fleet(tmp_path, folder, folder, folder)
         await fleet.deploy(config("1", "2", "10", production="1"))
+        fleet.look_together()
         versions = ("2", "10", "10")  # two of the three want the same
         outcomes = await asyncio.gather(
             *(
@@ -148,6 +163,7 @@ def test_two_operators_that_roll_back_at_once_go_back_once(folder: Path, tmp_pat
         for version in ("2", "10"):
             await fleet.controls[0].give(aliasing(version), "ur5")
         await fleet.follow()
+        fleet.look_together()
         await asyncio.gather(*(control.give(Rollback(), "ur5") for control in fleet.controls))
         await fleet.follow()
         assert fleet.defaults() == ["2", "2"] and fleet.numbers() == {4}
