@@ -387,22 +387,24 @@ def test_two_writers_of_one_folder_do_not_meet(ur5: Path, tmp_path: Path) -> Non
     assert sorted((episode.id, len(episode)) for episode in episodes(Recording(tmp_path))) == [("one", 10), ("two", 10)]
 
 
-def test_file_being_written_is_not_deleted_by_another_writer(ur5: Path, tmp_path: Path, rng: Rng) -> None:
+def test_file_being_written_is_not_deleted_by_another_writer(ur5: Path, tmp_path: Path) -> None:
     contract = Policy.load(ur5).contract
 
-    def fill_folder() -> None:
-        with Recorder(tmp_path, max_file_bytes=MIB, max_folder_bytes=2 * MIB, wait=True) as other:
-            policy = other.policy(contract)
-            for step in range(25_000):
-                other.record(DecisionRecord(policy, rng.standard_normal(27), rng.uniform(-1, 1, 6), "e", step))
+    def record_in_full_folder(oldest: Path) -> None:
+        """Record where a younger file already takes more than the folder may."""
+        oldest.with_name(oldest.name.replace("000001", "000002")).write_bytes(bytes(4 * MIB))
+        os.utime(oldest, (1, 1))
+        with Recorder(tmp_path, max_file_bytes=MIB, max_folder_bytes=2 * MIB) as other:
+            other.record(DecisionRecord(other.policy(contract), np.zeros(27), np.zeros(6)))
 
     with Recorder(tmp_path) as first:
         first.record(DecisionRecord(first.policy(contract), np.zeros(27), np.zeros(6)))
         wait_for(lambda: first.written == 1)
         (file,) = tmp_path.iterdir()
-        fill_folder()
+        wait_for(lambda: list(episodes(Recording(file))) != [], "it is on the disk")
+        record_in_full_folder(file)
         assert file.exists()
-    fill_folder()
+    record_in_full_folder(file)
     assert not file.exists()
 
 
