@@ -126,6 +126,8 @@ class _Connection:
             self.receive = rtde_receive.RTDEReceiveInterface(host, self.rate_hz, VARIABLES)
             self._check_modes(host)
             self.control = rtde_control.RTDEControlInterface(host, self.rate_hz)
+            # It has seen the program run on a connection of its own; on a busy machine the other one is behind.
+            _wait_until(lambda: bool(self.receive.getRobotStatus() & 2))
         except RobotError:
             raise
         except Exception as error:  # RuntimeError, logic_error as RuntimeError, boost's own
@@ -144,9 +146,7 @@ class _Connection:
             raise RobotError(f"the controller at {settings.host} is a {found}'s, but ur_model is {settings.ur_model}")
 
     def _check_modes(self, host: str) -> None:
-        limit = time.monotonic() + FIRST_STATE_S
-        while self.receive.getTimestamp() == 0.0 and time.monotonic() < limit:
-            time.sleep(0.005)
+        _wait_until(lambda: self.receive.getTimestamp() != 0.0)
         mode, safety = self.receive.getRobotMode(), self.receive.getSafetyMode()
         if safety not in SAFE_MODES:
             name = STOP_NAMES.get(safety, f"safety mode {safety}").replace("_", " ")
@@ -159,6 +159,12 @@ class _Connection:
             self.control.stopScript()
             self.control.disconnect()
         self.receive.disconnect()
+
+
+def _wait_until(condition: Callable[[], bool]) -> None:
+    limit = time.monotonic() + FIRST_STATE_S
+    while not condition() and time.monotonic() < limit:
+        time.sleep(0.005)
 
 
 class Connection(Protocol):

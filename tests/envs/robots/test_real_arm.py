@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 import time
 import urllib.request
 from collections.abc import Iterator
@@ -63,6 +65,33 @@ def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> 
         assert info["final_status"] == "success"
         assert states <= {"blend_in", "run", "hold"}
     assert [why for _, why in arm.controller.stop_reasons] == ["it reached its end"]
+
+
+LAGGING = """
+import sys, time, rtde_receive
+from rlservo.envs.robots.command_stream import StreamSettings, connect
+from rlservo.envs.robots.limits import Limits
+
+class Lagging(rtde_receive.RTDEReceiveInterface):
+    seen_s = float("inf")
+    def getRobotStatus(self):
+        status = super().getRobotStatus()
+        if status & 2:
+            self.seen_s = min(self.seen_s, time.monotonic())
+        return status if time.monotonic() > self.seen_s + 0.3 else status & ~2
+
+rtde_receive.RTDEReceiveInterface = Lagging
+connection = connect(StreamSettings(sys.argv[1], "ur5", 0.1, 0.25, Limits(watchdog_hz=1.0), 0, 0))
+print("runs", connection.receive.getRobotStatus() & 2)
+connection.close()
+"""
+
+
+def test_state_that_lags_behind_the_program_is_waited_for(arm: RunningArm) -> None:
+    """The program is started through one connection, and its state comes through another."""
+    command = [sys.executable, "-c", LAGGING, arm.host]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    assert "runs 2" in done.stdout, done.stderr
 
 
 def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_taken(arm: RunningArm) -> None:
