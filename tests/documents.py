@@ -44,6 +44,7 @@ BEGUN = {
 }
 """What such a command prints when it has begun; the others invite to press Ctrl-C."""
 RAY_GAVE_UP = "The current node timed out during startup"  # on a busy machine, after its 30 s (ray 2.60): tried again
+WATCHDOG = "the controller's watchdog (no command for 0.1 s)"  # on a busy machine: begun again, once
 QUESTION = "[y/N] "
 NOT_HERE = re.compile(r"^(pip install|make) ")  # tests/test_wheel.py installs, tests/system/test_demo.py makes
 PORTS = ("8000", "8080", "8090", "6379", "9090", "50051")
@@ -188,7 +189,7 @@ class Shell:
         finally:
             os.close(self.terminals.pop(started))
 
-    def _finish(self, script: str) -> str:
+    def _finish(self, script: str, *, is_again: bool = False) -> str:
         """Run a script to its end, and answer what it asks."""
         if not script.strip():
             return ""
@@ -204,6 +205,8 @@ class Shell:
                 started.wait(0.1)
         if self.machine and started.returncode and RAY_GAVE_UP in self._printed("output"):
             return self._finish(f"ray stop --force\n{script}")
+        if started.returncode and WATCHDOG in self._printed("output") and not is_again:
+            return self._finish(script, is_again=True)
         assert started.returncode == 0, f"{script}\n{self._printed('output')}"
         return self._printed("output")
 
