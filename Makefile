@@ -22,7 +22,7 @@ TEST_TOOLS := 'pytest>=8' pytest-timeout pytest-xdist pytest-random-order httpx 
 demo: setup  ## Export the two shipped checkpoints, serve them, drive both simulators; a table and a picture in demo/
 	$(BIN)/rlservo demo --out demo
 
-test: setup  ## All tests, in five processes: on two cores three of them often wait
+test: setup  ## All tests, in five processes on two cores: many tests wait
 	$(BIN)/python -m pytest -n 5
 
 quick: setup  ## Unit tests, in a minute on two cores that nothing else uses

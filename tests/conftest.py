@@ -83,6 +83,7 @@ TOGETHER = {
 
 # The longest files begin first, those that mostly wait next to those that compute: none is left for the end. Of those
 # that need the same checkpoints one begins; the others come when they are trained.
+# The files with slow tests follow, then the rest.
 LONGEST = (
     "robots in real time", "live server", "one Ray", "tests/system/test_documents_run.py",
     "ports of server managers", "tests/export/proof/test_exploration.py", "cluster", "shipped server",

@@ -205,7 +205,7 @@ class Shell:
                 started.wait(0.1)
         if self.machine and started.returncode and RAY_GAVE_UP in self._printed("output"):
             return self._finish(f"ray stop --force\n{script}")
-        if started.returncode and WATCHDOG in self._printed("output") and not is_again:
+        if self.machine and started.returncode and WATCHDOG in self._printed("output") and not is_again:
             return self._finish(script, is_again=True)
         assert started.returncode == 0, f"{script}\n{self._printed('output')}"
         return self._printed("output")
