@@ -376,6 +376,7 @@ def main(argv: list[str]) -> None:
             threading.Thread(target=_end_soon, name="end", daemon=True).start()
             connection.close()
     except RobotError as error:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it ends by itself; its owner closes its input now
         _say(output, f"{FAILED}{error}")
         raise SystemExit(1) from None
 

@@ -58,6 +58,7 @@ def measure_latency(
         arm.hold()
         began = time.monotonic()
         while time.monotonic() - began < PAUSE_S or np.abs(arm.arm_state().velocities).max() > NOTICED / 2:
+            _check_fault(arm)
             if time.monotonic() - began > PAUSE_S + TIMEOUT_S:
                 raise RobotError(f"the robot does not come to rest within {PAUSE_S + TIMEOUT_S:g} s")
             time.sleep(LOOK_S)
@@ -99,10 +100,14 @@ def _first_motion(arm: RtdeArm, goal: Vector, began: float, periods_s: list[floa
             before = state
         if abs(state.velocities[JOINT]) > NOTICED:
             return state.received_s
-        if fault := arm.fault:
-            raise RobotError(f"the robot stopped: {fault}")
+        _check_fault(arm)
         if time.monotonic() - given > AGAIN_S:  # a setpoint lasts for half a second
             given = time.monotonic()
             arm.command(goal, max(began + STEP_S - given, AGAIN_S))
         time.sleep(LOOK_S)
     raise RobotError(f"{JOINTS[JOINT]} did not move within {TIMEOUT_S:g} s of a command: check the speed slider")
+
+
+def _check_fault(arm: RtdeArm) -> None:
+    if fault := arm.fault:
+        raise RobotError(f"the robot stopped: {fault}")

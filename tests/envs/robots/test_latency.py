@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from arms import RunningArm
+from rlservo.envs.robots.arm import RobotError
 from rlservo.envs.robots.latency import measure_latency
 from rlservo.envs.robots.limits import Limits
 from rlservo.envs.robots.rtde_arm import RtdeArm
@@ -35,3 +36,12 @@ def test_motion_that_was_cut_short_is_followed_by_a_whole_one(arm: RunningArm) -
     finally:
         real.close()
     assert report.steps == 2
+
+
+def test_robot_that_stops_between_two_motions_says_why(arm: RunningArm) -> None:
+    real = RtdeArm(arm.host, "ur5", setpoint_timeout_s=0.5, limits=Limits(watchdog_hz=1.0))
+    try:
+        with pytest.raises(RobotError, match="the robot stopped: protective_stop: find the cause"):
+            measure_latency(real, on_step=lambda _: arm.do(lambda: arm.controller.stop_protectively("a test")))
+    finally:
+        real.close()
