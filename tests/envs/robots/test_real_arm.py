@@ -226,7 +226,7 @@ HOSTILE_PAUSES_S = {"random": 0.05, "extremes": 0.6, "jitter": 0.02, "silence": 
 @pytest.mark.parametrize("stream", HOSTILE_PAUSES_S)
 def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningArm, stream: str) -> None:
     rng, pause_s = np.random.default_rng(7), HOSTILE_PAUSES_S[stream]
-    walls = {"box_low": [-2.0, -2.0, 0.62], "box_high": [2.0, 2.0, 0.78], "tool_speed": 0.25}
+    walls = {"box_low": [-2.0, -2.0, 0.62], "box_high": [2.0, 2.0, 0.78], "tool_speed": 0.15}
     real = RtdeArm(arm.host, "ur5", velocity_scale=0.1, limits=Limits.of({**LIMITS, **walls}))
     try:
         for step in range(int(3.0 / pause_s)):
@@ -255,10 +255,10 @@ def test_hostile_setpoints_never_make_the_arm_jump_or_pass_a_limit(arm: RunningA
     most = 0.1 * np.array(controller.simulation.parameters.velocity_limits)
     tools = [controller.simulation.tool_at(one.positions)[0] for one in samples]
     for index in range(first, last):
-        one, bound = samples[index], max(pace[index], 1.0)
+        one, bound = samples[index], max(1.0, *pace[max(index - 8, 0) : index + 1])  # the drives follow the pace late
         assert (abs(one.setpoint_velocity) <= most * pace[index] * 1.0001 + 1e-9).all()
         assert (abs(one.velocities) <= most * bound * 1.05).all()  # the simulated drives overshoot by a few percent
-        assert np.linalg.norm(tools[index] - tools[index - 1]) / controller.dt <= 0.25 * bound
+        assert np.linalg.norm(tools[index] - tools[index - 1]) / controller.dt <= 0.15 * bound
         assert 0.62 <= tools[index][2] <= 0.78
         assert (abs(one.positions) <= LIMIT).all()
     assert np.median(pace[first:last]) <= 1.01, "the commands came too seldom, or in bunches, to judge by"
