@@ -131,9 +131,9 @@ def algorithm_config(settings: dict[str, Any], seed: int) -> AlgorithmConfig:
         min_time_s_per_iteration=0,
         min_sample_timesteps_per_iteration=settings.get("steps_per_iteration", 0),
     )
-    config.callbacks(on_episode_end=_log_episode)
+    config.callbacks(on_episode_end=log_episode)
     if settings.get("orthogonal_weights"):
-        config.callbacks(on_algorithm_init=_draw_orthogonal)
+        config.callbacks(on_algorithm_init=draw_orthogonal)
     config.debugging(seed=seed, log_level="ERROR")
     return config
 
@@ -249,7 +249,7 @@ def _mean_std_filter(*_: Any) -> MeanStdFilter:
     return MeanStdFilter()
 
 
-def _draw_orthogonal(*, algorithm: Algorithm, **_: Any) -> None:
+def draw_orthogonal(*, algorithm: Algorithm, **_: Any) -> None:
     """Draw the weights as Stable-Baselines3's PPO does: orthogonal, the policy's last layer small.
 
     The first actions are then noise around 0, whatever is observed. RLlib (2.60) has no setting for the weights of its
@@ -268,7 +268,7 @@ def _draw_orthogonal(*, algorithm: Algorithm, **_: Any) -> None:
     runners.sync_weights(from_worker_or_learner_group=learners, inference_only=True)
 
 
-def _log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:
+def log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any = None, **_: Any) -> None:
     # Sums: RLlib's own means and windows cover one iteration's episodes, which may be few or many.
     chunks = [*(prev_episode_chunks or ()), episode]  # an episode is cut at the end of a sampling phase
     total, length = sum(chunk.get_return() for chunk in chunks), sum(map(len, chunks))

@@ -42,7 +42,7 @@ class DrivePanel:
         self._drawn: Stage | None = None
         self._drawn_contract: Contract | None = None
         gui = server.gui
-        self._status = gui.add_markdown("")
+        self.status = gui.add_markdown("")
         with gui.add_folder("Drive"):
             time_buttons = gui.add_button_group("Time", ("Play", "Pause", "Step"))
             times = {"Play": drive.play, "Pause": drive.pause, "Step": drive.step}
@@ -125,8 +125,8 @@ class DrivePanel:
             set_value(self._version, self._drive.choice.version)
             set_value(self._robot, view.stage.arguments.get("ur_model", "ur5"))
         content = "\n\n".join(lines)
-        if self._status.content != content:
-            self._status.content = content
+        if self.status.content != content:
+            self.status.content = content
 
     def _rebuild(self, view: View) -> None:
         """Draw another robot."""

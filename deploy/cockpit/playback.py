@@ -115,7 +115,7 @@ class PlaybackPanel:
         self._scenes: tuple[Scene, Scene] | None = None
         self._last = time.perf_counter()
         gui = server.gui
-        self._status = gui.add_markdown("")
+        self.status = gui.add_markdown("")
         with gui.add_folder("Recording"):
             titles = tuple(f"{number}: {_title(episode)}" for number, episode in enumerate(tape.episodes))
             self._choice = gui.add_dropdown("Episode", titles)
@@ -157,7 +157,7 @@ class PlaybackPanel:
         if cycle.is_late:
             lines.append(f"⚠ **The action is not the policy's.** {escape(cycle.fallback)}")
         lines += [f"⚠ {escape(sentence)}" for sentence in words]
-        self._status.content = "\n\n".join(lines)
+        self.status.content = "\n\n".join(lines)
         set_value(self._slider, row)
 
     def close(self) -> None:

@@ -41,7 +41,7 @@ class WatchPanel:
         self._is_closed = threading.Event()
         self._states: deque[RobotState] = deque([state], maxlen=WINDOW)
         gui = server.gui
-        self._status = gui.add_markdown("")
+        self.status = gui.add_markdown("")
         with gui.add_folder("State"):
             self._names = _plotted(state)
             self._plot = Plot(gui, "Last looks, 20 a second", self._names)
@@ -66,7 +66,7 @@ class WatchPanel:
         lines = [f"**robot server {self._reader.address}**, {frames_per_s:.0f} frames/s"]
         if self.trouble:
             lines.append(f"⚠ **{escape(self.trouble)}**")
-        self._status.content = "\n\n".join(lines)
+        self.status.content = "\n\n".join(lines)
         rows = [quantities(state) for state in states]
         self._plot.update(range(len(rows)), [[row[name][0] for row in rows] for name in self._names])
         self._table.content = (

@@ -65,7 +65,7 @@ def list_policies(
     if as_json:
         print_json([shown, *({"replica": process, "generation": number} for process, number in others.items())])
         return
-    terminal.output().print(_table(shown))
+    terminal.output().print(table_of(shown))
     for sentence in shown["behind"]:
         terminal.output().print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
     for process, number in others.items():
@@ -213,7 +213,7 @@ def _give(
     terminal.output().print("; ".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
-def _table(replica: dict[str, Any]) -> Table:
+def table_of(replica: dict[str, Any]) -> Table:
     table = _columns(
         f"process {replica['replica'] or 'of the server'}, plan {replica['generation']} ({replica['changed_by']})",
         *("policy", "version", "state", "aliases", "since (UTC)", "requests", "reason"),

@@ -101,7 +101,7 @@ class Mir100Navigation(RenderedEnv):
         self.action_space = self._action_box
 
         self._camera = Camera(self.simulation.model, self.simulation.data, **self.VIEW)
-        self._observed_beams = pick_beams(self.LASER_COUNT)
+        self.observed_beams = pick_beams(self.LASER_COUNT)
         self._shown_readings: NDArray[np.floating[Any]] | None = None  # of an observation that is looked at
         self._previous_distance: float | None = None
         self._steps = 0
@@ -313,7 +313,7 @@ class Mir100Navigation(RenderedEnv):
         observation[1] = bearing
         observation[2:4] = self.simulation.velocity
         if self.LASER_COUNT:
-            observation[4:] = self.simulation.scan[self._observed_beams]
+            observation[4:] = self.simulation.scan[self.observed_beams]
         return observation
 
 

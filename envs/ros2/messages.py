@@ -162,7 +162,7 @@ def scan_points(scan: Any, pose: tuple[float, float, float] = (0.0, 0.0, 0.0)) -
 
 def readings(points: Vector) -> Vector:
     """Return the readings (1012,) [m] of the MiR100's two scanners for points (n, 2) [m] in base_link."""
-    return np.concatenate([_seen_by(FRONT_SCANNER, points), _seen_by(BACK_SCANNER, points)])
+    return np.concatenate([seen_by(FRONT_SCANNER, points), seen_by(BACK_SCANNER, points)])
 
 
 def scanner_pose(scanner: Scanner) -> tuple[float, float, float]:
@@ -170,7 +170,8 @@ def scanner_pose(scanner: Scanner) -> tuple[float, float, float]:
     return scanner.position[0], scanner.position[1], scanner.yaw
 
 
-def _seen_by(scanner: Scanner, points: Vector) -> Vector:
+def seen_by(scanner: Scanner, points: Vector) -> Vector:
+    """Return the readings [m] of one scanner, without those that it drops."""
     x, y, yaw = scanner_pose(scanner)
     ahead = points - (x, y)
     angles = (np.arctan2(ahead[:, 1], ahead[:, 0]) - yaw + math.pi) % (2.0 * math.pi) - math.pi

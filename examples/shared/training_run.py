@@ -164,7 +164,7 @@ def ray_session(
         sys.path.insert(0, own)
     path = os.pathsep.join(part for part in (own, os.environ.get("PYTHONPATH", "")) if part)
     quiet["runtime_env"] = {"env_vars": {"PYTHONPATH": path}}
-    with _sigterm_as_ctrl_c() as take_sigterm:
+    with sigterm_as_ctrl_c() as take_sigterm:
         try:
             if address is None:
                 # A short path: Ray's sockets live below it, and a socket's path may have 107 characters.
@@ -229,7 +229,7 @@ def local_gpus() -> float:
 
 
 @contextlib.contextmanager
-def _sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
+def sigterm_as_ctrl_c() -> Iterator[Callable[[], None]]:
     """Let SIGTERM do what Ctrl-C does; returns the function that installs it again."""
 
     def forward(number: int, frame: FrameType | None) -> None:

@@ -114,7 +114,7 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
         super().__init__(
             input_observation_space=input_observation_space, input_action_space=input_action_space, **kwargs
         )
-        _check_filter()
+        check_filter()
         self._device = device
         self._before: Any = None  # the statistics that were set last
 
@@ -130,7 +130,7 @@ class MeanStdFilter(env_to_module.MeanStdFilter):
         for episode in episodes:
             row = np.asarray(episode.observations.data[-1])
             if self._update_stats:
-                _push(running.running_stats, row)
+                push(running.running_stats, row)
             row = _filtered(row, running)
             episode.observations.data[-1] = row  # the learner sees this
             if episode.observation_space is not self.observation_space:
@@ -347,12 +347,12 @@ def _is_gaussian(module: Any, outputs: dict[str, Any]) -> bool:
         Columns.ACTIONS not in outputs
         and module.get_exploration_action_dist_cls() is TorchDiagGaussian
         and outputs[Columns.ACTION_DIST_INPUTS].is_cpu
-        and _draws_the_same()
+        and draws_the_same()
     )
 
 
 @functools.cache
-def _draws_the_same() -> bool:
+def draws_the_same() -> bool:
     """Return whether these versions of RLlib, torch and numpy draw the same with `_draw`, bit by bit."""
     generator = torch.default_generator  # the processor's: a GPU's random numbers are not touched
     before = generator.get_state()
@@ -412,7 +412,7 @@ def _array(value: Any) -> Any:
     return array.astype(np.int32) if array.dtype == np.int64 else array
 
 
-def _push(stats: RunningStat, row: Any) -> None:
+def push(stats: RunningStat, row: Any) -> None:
     """Do what `RunningStat.push` does, operation by operation, without copies, checks and what is new (below)."""
     stats.num_pushes += 1
     if stats.num_pushes == 1:
@@ -441,13 +441,13 @@ def _tell_what_is_new(stats: RunningStat, before: RunningStat | None) -> None:
 
 
 @functools.cache
-def _check_filter() -> None:
+def check_filter() -> None:
     """Raise UsageError if this Ray's filter does not do what is written here, bit by bit."""
     theirs: Any = RunningFilter((3,))
     ours: Any = RunningFilter((3,))
     try:
         for row in np.random.default_rng(0).normal(2.0, 5.0, (9, 3)).astype(np.float32):
-            _push(ours.running_stats, row)
+            push(ours.running_stats, row)
             same = theirs(row).tobytes() == _filtered(row, ours).tobytes()
             stats, own = theirs.running_stats, ours.running_stats
             if not same or any(getattr(stats, name).tobytes() != getattr(own, name).tobytes() for name in SUMS):

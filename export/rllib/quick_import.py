@@ -47,8 +47,8 @@ def prepare() -> None:
     torch's shared libraries are mapped while other modules are imported, without Python's lock: this saves a quarter of
     a second.
     """
-    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _Finder())
+    if not any(isinstance(finder, Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, Finder())
     if "torch" not in sys.modules:
         # Not a daemon: a process that ends at once, for a wrong path, must not end in the middle of this.
         threading.Thread(target=_load_torch_library, name="torch-library").start()
@@ -67,7 +67,7 @@ def import_needed() -> None:
 
     If another version of RLlib cannot be imported this way, it is imported as usual.
     """
-    finder = next((finder for finder in sys.meta_path if isinstance(finder, _Finder)), None)
+    finder = next((finder for finder in sys.meta_path if isinstance(finder, Finder)), None)
     if finder is None or "ray.rllib" in sys.modules:
         return
     with finder.deferring(), contextlib.suppress(ImportError):
@@ -75,7 +75,7 @@ def import_needed() -> None:
             importlib.import_module(name)
 
 
-class _Finder:
+class Finder:
     """Finder of Ray's packages that defers them, and later runs the deferred packages above a module first."""
 
     def __init__(self) -> None:
@@ -109,7 +109,7 @@ class _Finder:
 class _Loader:
     """Loader that makes a package's module and runs its `__init__` at the first use."""
 
-    def __init__(self, loader: Any, finder: _Finder) -> None:
+    def __init__(self, loader: Any, finder: Finder) -> None:
         self._loader = loader
         self._finder = finder
 

@@ -34,7 +34,7 @@ class Shadows:
 
     def __init__(self, record: Record) -> None:
         self._record = record
-        self._waiting: queue.Queue[tuple[Policy, Any, Decision]] = queue.Queue(WAITING)
+        self.waiting: queue.Queue[tuple[Policy, Any, Decision]] = queue.Queue(WAITING)
         self._thread: threading.Thread | None = None
         self.missed: Counter[tuple[tuple[str, str, str], str]] = Counter()
         """Actions that were not compared, by ((policy, version, shadow), reason)."""
@@ -53,13 +53,13 @@ class Shadows:
             self._thread = threading.Thread(target=self._run, name="shadow", daemon=True)
             self._thread.start()
         try:
-            self._waiting.put_nowait((shadow, obs, decision))
+            self.waiting.put_nowait((shadow, obs, decision))
         except queue.Full:
             self.missed[series, "left-out"] += 1
 
     def _run(self) -> None:
         while True:
-            shadow, obs, decision = self._waiting.get()
+            shadow, obs, decision = self.waiting.get()
             series = (decision.name, decision.version, shadow.contract.version)
             try:
                 differences = _differences(shadow.act(obs), decision.action, batch=decision.batch)

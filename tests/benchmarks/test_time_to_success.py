@@ -92,7 +92,7 @@ def test_orthogonal_weights_reach_the_runners() -> None:
     learners = SimpleNamespace(foreach_learner=lambda function: function(learner))
     synced: list[Any] = []
     runners = SimpleNamespace(sync_weights=lambda **options: synced.append(options["from_worker_or_learner_group"]))
-    time_to_success.train_shipped._draw_orthogonal(
+    time_to_success.train_shipped.draw_orthogonal(
         algorithm=SimpleNamespace(learner_group=learners, env_runner_group=runners)
     )
     for name, gain in (("encoder", 2**0.5), ("pi", 0.01), ("vf", 1.0)):

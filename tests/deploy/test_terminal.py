@@ -91,7 +91,7 @@ def test_waiting_is_a_line_that_goes_away_on_a_terminal_and_leaves_results_where
 def test_list_of_policies_is_whole_at_80_columns() -> None:
     from rich.console import Console
 
-    from rlservo.deploy.commands.policy import _table
+    from rlservo.deploy.commands.policy import table_of
 
     version = {
         "version": "12", "state": "serving", "aliases": ["production", "candidate"],
@@ -103,7 +103,7 @@ def test_list_of_policies_is_whole_at_80_columns() -> None:
         "policies": [{"name": name, "version_states": [version]}],
     }  # fmt: skip
     out = io.StringIO()
-    Console(width=80, file=out).print(_table(replica))
+    Console(width=80, file=out).print(table_of(replica))
     columns = zip(
         *(line.split("\u2502")[1:-1] for line in out.getvalue().splitlines() if "\u2502" in line), strict=True
     )

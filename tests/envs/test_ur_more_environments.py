@@ -259,14 +259,15 @@ def test_avoidance_refuses_a_ball_inside_the_arm() -> None:
         env.reset(options={"fixed_object_position": [1, 2]})
 
 
-def test_avoidance_random_balls_are_drawn_from_robo_gyms_ranges() -> None:
+def test_avoidance_random_balls_are_drawn_from_robo_gyms_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
     env = avoidance()
+    move, drawn = env.simulation.move_objects, {}
+    monkeypatch.setattr(env.simulation, "move_objects", lambda paths: (drawn.update(paths), move(paths)))
     lowest, highest = [], []
     for seed in range(60):
         env.reset(seed=seed)
-        path = next(iter(env.simulation._moving.values()))[:, 2] - 0.1  # base_link stands on the table
-        lowest.append(path.min())
-        highest.append(path.max())
+        lowest.append(drawn[0][:, 2].min())
+        highest.append(drawn[0][:, 2].max())
         assert not env.simulation.in_collision
     amplitude = (np.array(highest) - lowest) / 2
     offset = (np.array(highest) + lowest) / 2

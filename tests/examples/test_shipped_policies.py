@@ -13,7 +13,7 @@ import math
 import pickle
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -23,7 +23,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from ray.tune.registry import ENV_CREATOR, _global_registry
 
 from bundles import EXPORTED_WITH, PRODUCT
 from cache import cached, versions
@@ -244,7 +243,8 @@ def penalties(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
 
     def make(module: Any = None, **settings: Any) -> Any:
         learner = object.__new__(train_shipped.ActionPenaltyLearner)
-        learner.config, learner._module = SimpleNamespace(learner_config_dict=settings), {"default_policy": module}
+        learner.config = SimpleNamespace(learner_config_dict=settings)
+        monkeypatch.setattr(train_shipped.ActionPenaltyLearner, "module", {"default_policy": module})
         learner.build()
         return learner
 
@@ -361,20 +361,30 @@ def test_a_share_of_the_others_has_its_target_out_of_reach_and_does_not_come_aga
         train_shipped.ChosenEpisodes(gymnasium.make("CartPole-v1"), out_of_reach_share=0.2)
 
 
+def env_of(config: Any) -> Any:
+    """Return the environment that a training with this configuration steps."""
+    runner = config.env_runner_cls(config=config.env_runners(num_envs_per_env_runner=1), worker_index=0)
+    return runner.env.unwrapped.envs[0]
+
+
+def wrappers_of(env: Any) -> Iterator[type]:
+    while isinstance(env, gymnasium.Wrapper):
+        yield type(env)
+        env = env.env
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of spaces in float64
 def test_what_the_settings_say_of_episodes_reaches_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES)
     train_shipped = load("train_shipped")
     settings = evaluate_shipped.load_settings("mir100_obstacle_avoidance")
-    train_shipped.algorithm_config({**settings, "failed_again": 0.0, "out_of_reach": 1.0}, 0)
-    env = _global_registry.get(ENV_CREATOR, settings["env"])(settings["env_config"])
+    env = env_of(train_shipped.algorithm_config({**settings, "failed_again": 0.0, "out_of_reach": 1.0}, 0))
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
         assert observation[0] > 1.0 and abs(env.unwrapped.simulation.target[1]) > 4.0
     with pytest.raises(errors.UsageError, match=r"out_of_reach is -0\.1: expected a share of the episodes, 0 to 1"):
         train_shipped.algorithm_config({**settings, "out_of_reach": -0.1}, 0)
-    train_shipped.algorithm_config({**settings, "failed_again": 1.0, "out_of_reach": 0}, 0)
-    env = _global_registry.get(ENV_CREATOR, settings["env"])(settings["env_config"])
+    env = env_of(train_shipped.algorithm_config({**settings, "failed_again": 1.0, "out_of_reach": 0}, 0))
     env.reset(seed=0)
     assert abs(env.unwrapped.simulation.target[1]) < 4.0
     first, ended = env.unwrapped.simulation.target, False
@@ -384,8 +394,8 @@ def test_what_the_settings_say_of_episodes_reaches_the_environment(monkeypatch: 
     assert not info["is_success"] and info["is_ordinary"]
     env.reset()
     assert env.unwrapped.simulation.target == first and not env.step(np.zeros(2, np.float32))[-1]["is_ordinary"]
-    train_shipped.algorithm_config({**settings, "failed_again": 0}, 0)  # nothing is left for tests after this one
-    assert not _global_registry.contains(ENV_CREATOR, settings["env"])
+    env = env_of(train_shipped.algorithm_config({**settings, "failed_again": 0}, 0))  # nothing is left of it
+    assert train_shipped.ChosenEpisodes not in wrappers_of(env)
 
 
 @pytest.mark.parametrize("is_ordinary", [False, True])
@@ -407,7 +417,7 @@ def test_the_curve_is_of_the_episodes_that_the_environment_draws(
         def __len__(self) -> int:
             return 3
 
-    load("train_shipped")._log_episode(episode=Episode(), metrics_logger=logger)
+    load("train_shipped").log_episode(episode=Episode(), metrics_logger=logger)
     wanted = [("episodes", 1.0), ("judged", 1.0), ("return", 1.5), ("length", 3.0), ("success", 1.0)]
     assert logged == (wanted if is_ordinary else [])
 
@@ -417,9 +427,8 @@ def test_failed_episodes_come_again_in_that_training_alone(monkeypatch: pytest.M
     monkeypatch.syspath_prepend(EXAMPLES)
     train_shipped = load("train_shipped")
     for name, comes_again in (("mir100_obstacle_avoidance", True), ("ur5_positioning_disturbed", False)):
-        settings = evaluate_shipped.load_settings(name)
-        train_shipped.algorithm_config(settings, 0)
-        assert _global_registry.contains(ENV_CREATOR, settings["env"]) == comes_again
+        env = env_of(train_shipped.algorithm_config(evaluate_shipped.load_settings(name), 0))
+        assert (train_shipped.ChosenEpisodes in wrappers_of(env)) == comes_again
 
 
 @pytest.mark.parametrize("ctrl_c", [signal.SIG_IGN, signal.default_int_handler], ids=["ignored", "Python's"])
@@ -431,7 +440,7 @@ def test_sigterm_ends_a_training_also_where_a_shell_has_ctrl_c_ignored(
     training_run = importlib.import_module("shared.training_run")
     before = signal.signal(signal.SIGINT, ctrl_c)
     try:
-        with training_run._sigterm_as_ctrl_c(), pytest.raises(KeyboardInterrupt):
+        with training_run.sigterm_as_ctrl_c(), pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
     finally:
         signal.signal(signal.SIGINT, before)

@@ -91,5 +91,5 @@ def test_scripts_train_with_the_settings_beside_the_policy_that_ships(
     config = common.algorithm_config(chosen, args, 2)
     assert (config.env, config.env_config, config.seed) == (settings["env"], settings["env_config"], settings["seed"])
     assert {name: getattr(config, name) for name in settings["training"]} == settings["training"]
-    assert {name: getattr(config._model_config, name) for name in settings["model"]} == settings["model"]
+    assert {name: config.model_config[name] for name in settings["model"]} == settings["model"]
     assert (args.stop_timesteps, args.stop_reward) == (settings["stop"]["env_steps"], settings["stop"]["value"])

@@ -297,8 +297,7 @@ def test_mir100_among_obstacles_is_ours(drive: Drive, manager: ServerManager) ->
         ]
     )
     for (options, actions), theirs in zip(episodes, results, strict=True):
-        native._random_cubes = lambda cubes=theirs["obstacles"]: [tuple(cube) for cube in cubes]
-        native.reset(options=options)
+        native.reset(options={**options, "cubes": theirs["obstacles"]})
         lasers = 0.09  # six standard deviations of the difference of two noisy readings
         for index, action in enumerate(actions[: len(theirs["rewards"])]):
             observation, reward, terminated, truncated, info = native.step(np.array(action, dtype=np.float32))

@@ -102,7 +102,7 @@ def test_own_scans_become_the_readings_that_the_policy_was_trained_with(
         messages.scan_points(sent[topic], messages.scanner_pose(scanner))
         for topic, scanner in (("/f_scan", FRONT_SCANNER), ("/b_scan", BACK_SCANNER))
     ]
-    own = messages._seen_by(FRONT_SCANNER, points[0])
+    own = messages.seen_by(FRONT_SCANNER, points[0])
     assert own == pytest.approx(simulation.scan[: FRONT_SCANNER.count])
     together = messages.readings(np.concatenate(points))
     assert np.mean(np.abs(together - simulation.scan) < 0.05) > 0.9

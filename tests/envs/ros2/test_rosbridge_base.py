@@ -40,13 +40,13 @@ class RunningBase:
     """A base that is simulated in a thread of this process."""
 
     base: SimulatedBase
-    port: int
+    bridge: RosbridgeServer
     seen: list[tuple[float, float, float]] = field(default_factory=list)  # time.monotonic(), x [m], speed [m/s]
     commands: list[float] = field(default_factory=list)  # [m/s], that came
 
     @property
     def robot(self) -> str:
-        return f"rosbridge://127.0.0.1:{self.port}"
+        return f"rosbridge://127.0.0.1:{self.bridge.port}"
 
     @property
     def faults(self) -> LinkFaults:
@@ -71,7 +71,7 @@ class RunningBase:
 def base(request: pytest.FixtureRequest) -> Iterator[RunningBase]:
     world, is_stamped = getattr(request, "param", ("empty", False))
     bridge = RosbridgeServer("127.0.0.1", 0)
-    running = RunningBase(SimulatedBase([bridge], world=world, is_stamped=is_stamped, faults=LinkFaults()), bridge.port)
+    running = RunningBase(SimulatedBase([bridge], world=world, is_stamped=is_stamped, faults=LinkFaults()), bridge)
     tick = running.base.tick
     running.base.tick = lambda: (tick(), running.watch())[0]  # type: ignore[method-assign]
     command = running.base.simulation.command
@@ -123,7 +123,7 @@ def test_obstacle_environment_sees_what_the_simulated_one_sees(base: RunningBase
     )
     try:
         observation, _ = env.reset(seed=1)
-        beams = env.unwrapped._observed_beams  # type: ignore[attr-defined]
+        beams = env.unwrapped.observed_beams  # type: ignore[attr-defined]
         assert observation[4:] == pytest.approx(base.base.simulation.scan[beams], abs=0.15)
         assert env.unwrapped.target_position()[1] < 0.0  # type: ignore[attr-defined]  # on the other side
         *_, info = env.step(env.action_space.sample() * 0)
@@ -213,7 +213,7 @@ while True:
 
 def test_dead_mans_switch_must_be_held(base: RunningBase) -> None:
     real = RosBase(f"{base.robot},deadman=/deadman", limits=BaseLimits(blend_s=0.0, stop_distance=0.0))
-    press = base.base._links[0].advertise("/deadman", "std_msgs/msg/Bool")
+    press = base.bridge.advertise("/deadman", "std_msgs/msg/Bool")
     try:
         base.wait_until(lambda: (real.command(0.5, 0.0), "deadman_released" in real.limited())[1])
         assert base.seen[-1][2] < STANDS
@@ -231,7 +231,7 @@ def test_person_drives_the_base_until_it_is_given_back(base: RunningBase) -> Non
         "rlservo.envs:rlservo/NoObstacleNavigationMir100Rob-v0", robot=base.robot, confirm=False,
         disable_env_checker=True, limits={"stop_distance": 0.0},
     )  # fmt: skip
-    joystick = RosbridgeLink("127.0.0.1", base.port)
+    joystick = RosbridgeLink("127.0.0.1", base.bridge.port)
     drive = joystick.advertise("/cmd_vel", "geometry_msgs/msg/Twist")
     try:
         env.reset(options={"target_pose": (30.0, 0.0, 0.0)})
@@ -347,7 +347,7 @@ def test_clock_that_drifts_for_hours_is_no_age_but_a_late_message_is(robot: Drif
 
 
 def test_bridge_refuses_what_it_does_not_know_and_goes_on(base: RunningBase) -> None:
-    with connect(f"ws://127.0.0.1:{base.port}", compression=None) as client:
+    with connect(f"ws://127.0.0.1:{base.bridge.port}", compression=None) as client:
         for text in ("no JSON", '{"op": "fragment"}', "[]"):
             client.send(text)
             assert json.loads(client.recv(PATIENCE_S))["level"] == "error"
@@ -361,7 +361,9 @@ def test_bridge_refuses_what_it_does_not_know_and_goes_on(base: RunningBase) -> 
         assert abs(odometry["header"]["stamp"]["secs"] - time.time()) < PATIENCE_S  # ROS 1's, as a MiR's
 
 
-def test_link_that_was_closed_without_its_bridge_does_not_come_back_to_a_new_one() -> None:
+def test_link_that_was_closed_without_its_bridge_does_not_come_back_to_a_new_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     bridge = RosbridgeServer("127.0.0.1", 0)
     link = RosbridgeLink("127.0.0.1", bridge.port)
     link.advertise("/cmd_vel", messages.TWIST)
@@ -372,14 +374,21 @@ def test_link_that_was_closed_without_its_bridge_does_not_come_back_to_a_new_one
             assert time.monotonic() < limit
             time.sleep(0.02)
 
-    wait_until(lambda: any(one.advertised for one in bridge._clients))
+    other = RosbridgeLink("127.0.0.1", bridge.port)
+    wait_until(lambda: other.rivals("/cmd_vel"))
+    other.close()
     bridge.close()
-    wait_until(lambda: not link._ros.is_connected)
+    monkeypatch.setattr("rlservo.envs.ros2.rosbridge_link.CALL_S", 0.1)
+    with pytest.raises(RobotError, match="the rosbridge does not answer"):
+        link.publishers("/cmd_vel")
+    monkeypatch.undo()
     link.close()
     bridge = RosbridgeServer("127.0.0.1", bridge.port)
     try:
         time.sleep(3.0)  # roslibpy connects again after a second
-        assert not bridge._clients  # its topic would be commanded: our next link were refused
+        other = RosbridgeLink("127.0.0.1", bridge.port)
+        assert not other.rivals("/cmd_vel")
+        other.close()
     finally:
         bridge.close()
 

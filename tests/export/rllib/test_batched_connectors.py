@@ -18,7 +18,7 @@ from ray.rllib.utils.filter import RunningStat
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.export.rllib import batched_connectors
-from rlservo.export.rllib.batched_connectors import _check_filter, supports, use_batched_connectors
+from rlservo.export.rllib.batched_connectors import check_filter, supports, use_batched_connectors
 
 
 def runner(config: Any, env: str, envs: int, *, batched: bool, filtered: bool = False, **frames: int) -> Any:
@@ -32,9 +32,14 @@ def runner(config: Any, env: str, envs: int, *, batched: bool, filtered: bool = 
     return (config.env_runner_cls or SingleAgentEnvRunner)(config=config, worker_index=0)
 
 
+def connectors_of(one: Any) -> Any:
+    """Return the state of a runner's pipeline before its network."""
+    return one.get_state(components="env_to_module_connector")["env_to_module_connector"]
+
+
 def filter_state(one: Any) -> dict[str, Any]:
     """Return what a runner's pipeline keeps, but for what is new in it: RLlib's is wrong (below)."""
-    state = one._env_to_module.get_state()
+    state = connectors_of(one)
     for stats in (stats for piece in state.values() for stats in piece.get(None, {}).get("running_stats", ())):
         for name in [name for name in stats if "delta" in name]:
             del stats[name]
@@ -80,35 +85,36 @@ def test_a_runner_samples_the_same_bit_by_bit(kind: Any, env: str, envs: int, fi
 
 
 def test_actions_are_drawn_by_rllib_where_its_arithmetic_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert batched_connectors._draws_the_same()
+    assert batched_connectors.draws_the_same()
     expected = in_bytes(sampled(runner(PPOConfig(), "Pendulum-v1", 2, batched=True), True))
     monkeypatch.setattr(batched_connectors, "HALF_LOG_OF_TWO_PI", 1.0)
-    batched_connectors._draws_the_same.cache_clear()
+    batched_connectors.draws_the_same.cache_clear()
     try:
-        assert not batched_connectors._draws_the_same()
+        assert not batched_connectors.draws_the_same()
         assert in_bytes(sampled(runner(PPOConfig(), "Pendulum-v1", 2, batched=True), True)) == expected
     finally:
-        batched_connectors._draws_the_same.cache_clear()
+        batched_connectors.draws_the_same.cache_clear()
 
 
 def test_runners_are_merged_to_the_statistics_of_all_observations(monkeypatch: pytest.MonkeyPatch) -> None:
-    _check_filter()  # which pushes numbers of its own
+    check_filter()  # which pushes numbers of its own
     seen: list[Any] = []
-    push = batched_connectors._push
+    push = batched_connectors.push
 
     def noting(stats: RunningStat, row: Any) -> None:
         seen.append(np.array(row, np.float64))
         push(stats, row)
 
-    monkeypatch.setattr(batched_connectors, "_push", noting)
-    runners = [runner(PPOConfig(), "MountainCarContinuous-v0", 2, batched=True, filtered=True) for _ in range(3)]
-    pipelines = [one._env_to_module for one in runners]
-    for count in (50, 200, 3, 1000):  # the first of them does as a driver does: it samples nothing
-        for one in runners[1:]:
+    monkeypatch.setattr(batched_connectors, "push", noting)
+    runners = [runner(PPOConfig(), "MountainCarContinuous-v0", 2, batched=True, filtered=True) for _ in range(2)]
+    pipeline = runners[0].config.build_env_to_module_connector(env=runners[0].env, spaces=runners[0].spaces)
+    for count in (50, 200, 3, 1000):
+        for one in runners:
             one.sample(num_timesteps=count)
-        merged = pipelines[0].merge_states([pipeline.get_state() for pipeline in pipelines[1:]])
-        for pipeline in pipelines:
-            pipeline.set_state(merged)
+        merged = pipeline.merge_states([connectors_of(one) for one in runners])
+        pipeline.set_state(merged)
+        for one in runners:
+            one.set_state({"env_to_module_connector": merged})
         (state,) = merged["MeanStdFilter"][None]["running_stats"]
         stats = RunningStat.from_state(state)
         assert stats.num_pushes == len(seen)
@@ -198,9 +204,9 @@ def test_what_does_not_fit_is_refused_by_name() -> None:
 @pytest.mark.parametrize("change", ["push", "std"])
 def test_a_ray_that_filters_in_another_way_is_refused(change: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RunningStat, change, lambda *_: 1.0)
-    _check_filter.cache_clear()
+    check_filter.cache_clear()
     try:
         with pytest.raises(UsageError, match=r"^Ray [\d.]+ filters observations in another way"):
             runner(PPOConfig(), "Pendulum-v1", 1, batched=True, filtered=True)
     finally:
-        _check_filter.cache_clear()
+        check_filter.cache_clear()

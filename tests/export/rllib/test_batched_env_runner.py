@@ -100,7 +100,7 @@ def test_the_check_of_how_actions_are_drawn_leaves_the_random_numbers_as_they_ar
     torch.manual_seed(5)
     expected = torch.randn(4)
     torch.manual_seed(5)
-    batched_connectors._draws_the_same.__wrapped__()
+    batched_connectors.draws_the_same.__wrapped__()
     assert torch.equal(torch.randn(4), expected)
 
 

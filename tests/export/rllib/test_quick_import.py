@@ -44,7 +44,7 @@ def test_an_export_imports_nothing_that_it_does_not_use_and_it_is_there_later(tm
 
 
 @pytest.fixture
-def finder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[quick_import._Finder]:
+def finder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[quick_import.Finder]:
     """Give the finder for a package `outer`, whose `__init__`s write down that they ran."""
     (tmp_path / "outer" / "inner").mkdir(parents=True)
     (tmp_path / "journal.py").write_text("ran = []\n")
@@ -58,7 +58,7 @@ def finder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[quick_im
     (tmp_path / "outer" / "broken" / "__init__.py").write_text("import no_such_module\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(quick_import, "DEFERRED", ("outer",))
-    finder = quick_import._Finder()
+    finder = quick_import.Finder()
     sys.meta_path.insert(0, finder)
     yield finder
     sys.meta_path.remove(finder)
@@ -66,7 +66,7 @@ def finder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[quick_im
         del sys.modules[name]
 
 
-def test_a_deferred_package_runs_when_one_of_its_names_is_used(finder: quick_import._Finder) -> None:
+def test_a_deferred_package_runs_when_one_of_its_names_is_used(finder: quick_import.Finder) -> None:
     with finder.deferring():
         leaf = importlib.import_module("outer.inner.leaf")
     journal = importlib.import_module("journal")
@@ -81,14 +81,14 @@ def test_a_deferred_package_runs_when_one_of_its_names_is_used(finder: quick_imp
         _ = sys.modules["outer"].no_such_name
 
 
-def test_what_is_above_another_module_runs_before_it(finder: quick_import._Finder) -> None:
+def test_what_is_above_another_module_runs_before_it(finder: quick_import.Finder) -> None:
     with finder.deferring():
         importlib.import_module("outer.inner.leaf")
     importlib.import_module("outer.inner.other")
     assert importlib.import_module("journal").ran == ["outer", "inner", "other"]
 
 
-def test_a_package_that_cannot_be_imported_says_so_whoever_asks(finder: quick_import._Finder) -> None:
+def test_a_package_that_cannot_be_imported_says_so_whoever_asks(finder: quick_import.Finder) -> None:
     with finder.deferring():
         broken = importlib.import_module("outer.broken")
     for _ in range(2):

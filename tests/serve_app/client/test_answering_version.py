@@ -111,15 +111,15 @@ def test_canary_gets_its_share_of_the_episodes_and_each_of_them_one_version(arms
 def test_a_version_that_another_process_does_not_serve_yet_is_asked_for_again(
     arms: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fetch = PolicyClient._fetch_contract
+    get = PolicyStore.get
     unknown = [UnknownVersionError("policy 'ur5' has no version '2'")] * 2
 
-    def fetch_late(client: PolicyClient, version: str | None, timeout_s: float | None) -> Any:
+    def get_late(store: PolicyStore, name: str, version: str | None = None) -> Policy:
         if unknown and version == "2":
             raise unknown.pop()
-        return fetch(client, version, timeout_s)
+        return get(store, name, version)
 
-    monkeypatch.setattr(PolicyClient, "_fetch_contract", fetch_late)
+    monkeypatch.setattr(PolicyStore, "get", get_late)
     with PolicyClient(arms.url, "ur5") as client:
         assert np.array_equal(client.act(OBS), arms.action("1"))
         arms.move("2")

@@ -116,10 +116,10 @@ class Server:
             headers = {"content-type": "application/json", "x-session-id": f"cell-{next(self.numbers)}"}
             connection.request("POST", "/v1/policies/ur5/act", json.dumps({"obs": OBS, **fields}), headers)
             connection.getresponse().read()
-            while self.handler.shadows._waiting.qsize() > 30:  # more would be left out on a busy machine
+            while self.handler.shadows.waiting.qsize() > 30:  # more would be left out on a busy machine
                 time.sleep(0.01)
         connection.close()
-        while not self.handler.shadows._waiting.empty():
+        while not self.handler.shadows.waiting.empty():
             time.sleep(0.01)
 
     def failed(self, version: str, code: str) -> int:

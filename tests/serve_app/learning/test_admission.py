@@ -11,7 +11,7 @@ import pytest
 
 from rlservo.export.contract.errors import UsageError
 from rlservo.serve_app.learning.admission import Admission, Admitted, KnownVersion, named_reward, reward_of
-from rlservo.serve_app.recording.episodes import Episode, episodes
+from rlservo.serve_app.recording.episodes import Episode, EpisodeAssembler, episodes
 from rlservo.serve_app.recording.reader import Recording
 from rlservo.serve_app.recording.recorded_policy import WithRecording
 from rlservo.serve_app.runtime.policy import Policy
@@ -117,8 +117,11 @@ def drop(decision: dict[str, Any]) -> None:
 def test_a_forged_decision_is_dropped_with_its_episode(
     ur5: Path, tmp_path: Path, forge: Callable[[dict[str, Any]], None], reason: str
 ) -> None:
-    episode = recorded(ur5, tmp_path / "run.mcap")
-    forge(episode._decisions[3])
+    recorded(ur5, tmp_path / "run.mcap")
+    entries = list(Recording(tmp_path / "run.mcap").entries())
+    forge([entry.fields for entry in entries if entry.kind == "decision"][3])
+    assembler = EpisodeAssembler()
+    (episode,) = (episode for entry in entries for episode in assembler.add(entry))
     assert Admission("ur5", max_age=0).judge(episode, [known(episode)]) == [reason]
 
 

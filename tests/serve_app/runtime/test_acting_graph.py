@@ -14,7 +14,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.runtime import loading
+from rlservo.serve_app.runtime import acting_graph, loading
 from rlservo.serve_app.runtime.acting_graph import without_value
 from rlservo.serve_app.runtime.policy import Policy
 
@@ -86,10 +86,9 @@ def test_a_large_graph_is_opened_as_it_is(exported: Callable[..., Any], monkeypa
     """Making it again holds the interpreter's lock, during which no policy acts."""
     folder = exported(SHIPPED).path
     monkeypatch.setattr(loading, "LARGEST_MADE", 1000)
+    monkeypatch.setattr(acting_graph, "without_value", None)  # would fail
     policy = Policy.load(folder)
     assert policy.value(np.zeros(27)) is not None
-    assert isinstance(policy._ort_session, onnxruntime.InferenceSession)
-    assert "value" in {output.name for output in policy._ort_session.get_outputs()}
 
 
 @pytest.mark.trained
