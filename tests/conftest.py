@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +166,12 @@ class SharedFixtures:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(SharedFixtures())
+    if "PYTEST_XDIST_WORKER" not in os.environ:  # workers inherit it
+        # What libraries leave in the folder for temporary files, such as a browser's sockets, ends with the session.
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+        folder = tempfile.mkdtemp(prefix="t")  # the paths of Ray's sockets, in it, may have 107 characters
+        os.environ["TMPDIR"] = tempfile.tempdir = folder
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
 
 
 def pytest_collection_finish() -> None:
