@@ -38,7 +38,10 @@ RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of comma
 RUNNING = 7
 # Distance of a joint from its setpoint beyond which it does not follow: at rest, plus this much of its velocity.
 FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
-AHEAD_S = 0.1  # of a trajectory's point: the controller begins each new one at the arm's lagging position
+# The controller begins each trajectory where the arm is, behind its setpoint, and the next replaces it one period
+# later: a first point further ahead than these periods lets the arm fall back, by the square of the distance.
+PERIODS_AHEAD = 2.0
+LATE_S = 0.06  # for which a trajectory continues after that point, before it brakes
 DRIFT_GAIN = 2.0  # [1/s], of velocity commands
 LAST_S = 0.2  # [s] for the last velocity, zero, to leave
 KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTORY}
@@ -184,12 +187,13 @@ class RosArmConnection:
     # -- parts
 
     def _trajectory(self, goal: Vector, velocity: Vector) -> dict[str, Any]:
-        """Return two points: the setpoint, and then a stop, the end if no other trajectory comes."""
-        stop_s = float(np.abs(velocity).max()) / self._limits.acceleration
-        points: list[tuple[float, Vector, Vector]] = [(AHEAD_S, goal + velocity * AHEAD_S, velocity)]
+        """Return a way along the setpoint's, and then a stop, the end if no other trajectory comes."""
+        ahead_s, stop_s = PERIODS_AHEAD / self.rate_hz, float(np.abs(velocity).max()) / self._limits.acceleration
+        points: list[tuple[float, Vector, Vector]] = [(ahead_s, goal + velocity * ahead_s, velocity)]
         if stop_s > 0.0:
-            at = points[0]
-            points.append((at[0] + stop_s, at[1] + velocity * stop_s / 2.0, np.zeros(6)))
+            brake_s = ahead_s + LATE_S
+            points.append((brake_s, goal + velocity * brake_s, velocity))
+            points.append((brake_s + stop_s, goal + velocity * (brake_s + stop_s / 2.0), np.zeros(6)))
         return trajectory(self._joints, points)
 
     def _subscribe(self) -> None:
