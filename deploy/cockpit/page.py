@@ -139,7 +139,7 @@ def _aim(camera: viser.CameraHandle, position: Vector, look_at: Vector) -> None:
         down = SHEET * np.tan(camera.fov / 2) * np.linalg.norm(way) * up / np.linalg.norm(up)
         position, look_at = look_at - way - down, look_at - down
     if point_of(camera.position) is not None and point_of(camera.look_at) is not None:  # viser fails with others
-        with contextlib.suppress(ValueError):  # one came meanwhile
+        with contextlib.suppress(ValueError):  # the browser sent an impossible one just now
             camera.position, camera.look_at = position, look_at
 
 

@@ -38,10 +38,12 @@ RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of comma
 RUNNING = 7
 # Distance of a joint from its setpoint beyond which it does not follow: at rest, plus this much of its velocity.
 FOLLOWING_ERROR, FOLLOWING_LAG_S = 0.15, 0.5  # [rad], [s]
-# The controller begins each trajectory where the arm is, behind its setpoint, and the next replaces it one period
-# later: a first point further ahead than these periods lets the arm fall back, by the square of the distance.
+# The controller begins each trajectory where the arm is, behind its setpoint, and the next replaces it after one
+# period: of the way to a point n periods ahead the arm has then gone about 3 / n**2.
 PERIODS_AHEAD = 2.0
-LATE_S = 0.06  # for which a trajectory continues after that point, before it brakes
+BRAKE_S = 0.1  # from a trajectory's start until it brakes, if no other comes
+SLOWEST_HZ = PERIODS_AHEAD / BRAKE_S  # of trajectories
+SHORTEST_STOP_S = 1e-6  # the controller refuses points at equal times, in nanoseconds
 DRIFT_GAIN = 2.0  # [1/s], of velocity commands
 LAST_S = 0.2  # [s] for the last velocity, zero, to leave
 KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTORY}
@@ -60,6 +62,8 @@ class RosArmConnection:
         self._how = address["command"]
         self._limits = settings.limits
         self.rate_hz = settings.limits.rate_hz or RATE_HZ[self._how]
+        if self._how == "trajectory" and self.rate_hz < SLOWEST_HZ:
+            raise RobotError(f"rate_hz is {self.rate_hz:g}: trajectories need at least {SLOWEST_HZ:g} a second")
         self.receive = self.control = self
         self._joints = [address["prefix"] + name for name in JOINT_NAMES.values()]
         self._lock = threading.Lock()
@@ -139,8 +143,11 @@ class RosArmConnection:
         return 1 + 2 * self._modes["program_running"]
 
     def getTargetSpeedFraction(self) -> float:
-        """Return the speed scaling, 0 to 1. With trajectories the controller applies it itself."""
-        return 1.0 if self._how == "trajectory" else self._speed_percent / 100.0
+        """Return the speed scaling, 0 to 1.
+
+        The controller of trajectories scales them as well; alone that would only let the arm lag further behind.
+        """
+        return self._speed_percent / 100.0
 
     # -- control
 
@@ -187,13 +194,12 @@ class RosArmConnection:
     # -- parts
 
     def _trajectory(self, goal: Vector, velocity: Vector) -> dict[str, Any]:
-        """Return a way along the setpoint's, and then a stop, the end if no other trajectory comes."""
+        """Return points that continue the setpoint's motion at its last velocity, and then brake to a stop."""
         ahead_s, stop_s = PERIODS_AHEAD / self.rate_hz, float(np.abs(velocity).max()) / self._limits.acceleration
-        points: list[tuple[float, Vector, Vector]] = [(ahead_s, goal + velocity * ahead_s, velocity)]
-        if stop_s > 0.0:
-            brake_s = ahead_s + LATE_S
-            points.append((brake_s, goal + velocity * brake_s, velocity))
-            points.append((brake_s + stop_s, goal + velocity * (brake_s + stop_s / 2.0), np.zeros(6)))
+        if stop_s < SHORTEST_STOP_S:
+            return trajectory(self._joints, [(ahead_s, goal, np.zeros(6))])
+        points = [(at_s, goal + velocity * at_s, velocity) for at_s in dict.fromkeys((ahead_s, BRAKE_S))]
+        points.append((BRAKE_S + stop_s, goal + velocity * (BRAKE_S + stop_s / 2.0), np.zeros(6)))
         return trajectory(self._joints, points)
 
     def _subscribe(self) -> None:

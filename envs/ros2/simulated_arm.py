@@ -123,6 +123,9 @@ class SimulatedArm:
             if not (self._is_ready(point.positions, 6) and self._is_ready(point.velocities, 6)):
                 return
             after_s = point.time_from_start.sec + point.time_from_start.nanosec * 1e-9
+            if now_s + after_s <= points[-1][0]:
+                log.warning("a trajectory was rejected: its times do not increase")
+                return
             points.append((now_s + after_s, np.array(point.positions)[order], np.array(point.velocities)[order]))
         if np.abs(points[-1][2]).max() > 1e-6:
             log.warning("a trajectory was rejected: its last velocity is not zero")

@@ -78,7 +78,7 @@ class LeafParser:
         The notice is a sentence about values that are out of bounds and used anyway, usually empty. Raises
         ObservationError.
         """
-        numbers = self._pack(obs) if type(obs) is list else None
+        numbers = self.pack(obs) if type(obs) is list else None
         array, values, batch = self._read(obs) if numbers is None else (*numbers, False)
         if self._drift is not None:
             self._until_drift -= 1
@@ -94,7 +94,7 @@ class LeafParser:
             return array, batch, notice
         return array, batch, ""
 
-    def _pack(self, obs: list[Any]) -> tuple[NDArray[Any], list[float]] | None:
+    def pack(self, obs: list[Any]) -> tuple[NDArray[Any], list[float]] | None:
         """Return (array, its numbers) of a list of finite numbers; None for anything else, which `_read` handles."""
         if self._packer is None or not NUMBERS.issuperset(map(type, obs)):
             return None

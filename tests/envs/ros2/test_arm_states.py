@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rlservo.envs.robots.arm import RobotError
@@ -59,7 +60,8 @@ class Driver:
     rivals = publishers
 
     def subscribers(self, topic: str) -> list[Endpoint]:
-        return [Endpoint("/controller", messages.NUMBERS)]
+        is_trajectory = topic == COMMAND_TOPICS["trajectory"]
+        return [Endpoint("/controller", messages.JOINT_TRAJECTORY if is_trajectory else messages.NUMBERS)]
 
     def close(self) -> None: ...
 
@@ -83,6 +85,29 @@ def test_numbers_that_are_not_finite_never_replace_a_state(driver: Driver) -> No
     driver.values["joint_states"]["position"] = [math.nan] * 7
     driver.send("joint_states")
     assert arm.getActualQ() == [0.5] * 6
+
+
+@pytest.mark.parametrize("rate_hz", [20.0, 50.0, 500.0])
+@pytest.mark.parametrize("speed", [0.0, 1e-9, 0.3, 3.0])
+def test_every_trajectory_is_one_that_a_controller_takes(driver: Driver, speed: float, rate_hz: float) -> None:
+    limits = Limits(rate_hz=rate_hz, acceleration=5.0)
+    arm = RosArmConnection(replace(SETTINGS, host="ros2:command=trajectory", limits=limits))
+    arm.servoJ([0.5] * 6)
+    arm.servoJ([0.5 + speed / rate_hz] * 6)
+    points = driver.sent[-1]["points"]
+    times = [point["time_from_start"]["sec"] + point["time_from_start"]["nanosec"] * 1e-9 for point in points]
+    assert (np.diff([0.0, *times]) > 0.0).all()
+    assert points[-1]["velocities"] == [0.0] * 6
+    if speed > 0.1:
+        assert times[-2] == pytest.approx(0.1)
+        assert points[0]["velocities"] == pytest.approx([speed] * 6)
+        assert speed / (times[-1] - times[-2]) == pytest.approx(5.0)
+        assert points[-1]["positions"] == pytest.approx([0.5 + speed / rate_hz + speed * 0.1 + speed**2 / 10.0] * 6)
+
+
+def test_trajectories_that_brake_between_two_commands_are_refused(driver: Driver) -> None:
+    with pytest.raises(RobotError, match="rate_hz is 10: trajectories need at least 20 a second"):
+        RosArmConnection(replace(SETTINGS, host="ros2:command=trajectory", limits=Limits(rate_hz=10.0)))
 
 
 def test_velocity_command_is_zero_after_its_guard_was_killed(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> None:

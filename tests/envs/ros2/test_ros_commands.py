@@ -20,9 +20,10 @@ from rlservo.envs.robots.limits import Limits
 from rlservo.envs.robots.rtde_arm import RtdeArm
 arm = RtdeArm("ros2:command=" + sys.argv[1], "ur5", velocity_scale=0.1, limits=Limits.of({"blend_s": 0.1}))
 print("stream", arm.pid, flush=True)
-start = arm.arm_state().positions
+start, began = arm.arm_state().positions, time.monotonic()
 while not arm.fault:
-    arm.command(start + np.array([6.0, 0, 0, 0, 0, 0]), 3.0)
+    side = 1.0 if (time.monotonic() - began) % 7.0 < 3.5 else -1.0
+    arm.command(start + np.array([side * 3.0, 0, 0, 0, 0, 0]), 3.0)
     time.sleep(0.05)
 print("fault", arm.fault, flush=True)
 arm.close()
@@ -40,8 +41,10 @@ def test_killed_stream_leaves_a_standing_arm_with(how: str, ros: Ros) -> None:
     helpers = [int(pid) for pid in Path(f"/proc/{stream}/task/{stream}/children").read_text().split()]
     assert len(helpers) == (1 if how == "velocity" else 0)
     ros.wait_until(lambda: ros.speed() > 0.2)
-    time.sleep(3.0)  # an arm that falls back behind its setpoint counts as not following by then
+    time.sleep(4.0)  # it has turned back; if it fell back behind its setpoint, it counts as not following by then
     ros.wait_until(lambda: ros.speed() == pytest.approx(0.1 * np.pi, rel=0.05))
+    sim.type("slider 0.5")
+    ros.wait_until(lambda: ros.speed() == pytest.approx(0.05 * np.pi, rel=0.05))
     began_s = time.time()
     os.kill(stream, signal.SIGKILL)
     assert ros.moved_for(began_s) < BRAKING_S

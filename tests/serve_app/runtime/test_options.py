@@ -183,5 +183,5 @@ def test_lists_of_numbers_become_what_numpy_makes_of_them(dtype: str, monkeypatc
             except ObservationError as error:
                 results.append((error.message, error.details))
         assert repr(results[0]) == repr(results[1]), obs
-        taken += isinstance(results[0][0], bytes)
+        taken += quick.pack(obs) is not None
     assert taken > 500
