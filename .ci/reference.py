@@ -13,19 +13,21 @@ import re
 import sys
 import textwrap
 from collections.abc import Iterator
+from enum import Enum
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import typer
 from pydantic import BaseModel
 
+from rlservo import errors
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.spaces import Quantity
 from rlservo.deploy.cli import app
-from rlservo.export.contract import errors
-from rlservo.export.contract.contract import Contract
+from rlservo.policy.options import PolicyOptions
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.error_statuses import status_of
-from rlservo.serve_app.runtime.options import PolicyOptions
-from rlservo.serve_app.server import metrics
+from rlservo.serve_app.server import exposition, metrics
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 from rlservo.serve_app.versions.plan_commands import COMMANDS
 
@@ -61,15 +63,24 @@ def commands(command: Any, name: str) -> Iterator[tuple[str, Any]]:
             yield from commands(part, f"{name} {word}")
 
 
+def choices(kind: Any) -> tuple[str, ...]:
+    """Return the values of an option that takes only some."""
+    if inspect.isclass(kind) and issubclass(kind, Enum):
+        return tuple(str(one.value) for one in kind)
+    return get_args(kind) if get_origin(kind) is Literal else ()
+
+
 def option(part: Any) -> str:
     names = ", ".join(sorted(part.opts + part.secondary_opts, key=len, reverse=True)) or part.name
     if part.param_type_name == "argument":
         names = part.metavar or part.name
+    elif values := part.metavar or "|".join(choices(part.type_descriptor.annotation)):
+        names += f" {values}"
     facts = []
     if part.required:
         facts.append("required")
     default = part.default
-    if default not in (None, False, (), "") and not callable(default) and not part.required:
+    if default not in (None, False, (), [], "") and not callable(default) and not part.required:
         facts.append(f"default `{default}`")
     if getattr(part, "envvar", None):
         facts.append(f"variable `{part.envvar}`")
@@ -219,7 +230,7 @@ def metric_list() -> str:
             "replica. Drift (`observation_...`) is measured from one request in 16, for policies with `MeanStdFilter`."
         )
     )
-    found = sorted(metric_calls(metrics))
+    found = sorted([*metric_calls(metrics), *metric_calls(exposition)])
     text.append("\n".join(bullet(name, ", ".join([kind, *labels]), text) for name, kind, text, labels in found))
     return "\n\n".join(text) + "\n"
 
@@ -256,7 +267,7 @@ def contract() -> str:
         paragraph(
             "The graph's inputs are `obs` of shape `[batch, ...]` (nested spaces: one per leaf, `obs.<path>`) and "
             "`state_in.<name>`; its outputs are `action` (deterministic, ready for `env.step`), `action_dist_inputs`, "
-            "`value` or `q_values` if the checkpoint has them, and `state_out.<name>`. Exploring actions are sampled "
+            "`value` or `q_values` if the checkpoint has them, and `state_out.<name>`. Exploratory actions are sampled "
             "from `action_dist_inputs` by the runtime. `contract.json` has these fields:"
         )
     )
@@ -275,8 +286,22 @@ def contract() -> str:
         plain = [f"`{name}`" for name, f in fields if not f.description]
         text.append("\n".join(described))
         text.append(paragraph(f"{'Also' if described else 'Fields:'} {', '.join(plain)}.") if plain else "")
+    text += ["## Elements of an environment", paragraph(DESCRIBE.format(", ".join(get_args(Quantity)))), DESCRIBED]
     return "\n\n".join(part for part in text if part) + "\n"
 
+
+DESCRIBE = (
+    "Your own environment describes its elements in a classmethod, which the export reads (automatically for RLlib's "
+    "checkpoints, with `--env my_module:MyEnv-v0` for others) and a rollout compares. A quantity is one "
+    "of {}. Parts of a quaternion are four elements in their order, each with its `axis`."
+)
+DESCRIBED = """```py
+@classmethod
+def describe(cls, **constructor_arguments):
+    joint = {"name": "elbow", "unit": "rad", "quantity": "joint position", "joint": "elbow_joint"}
+    target = {"name": "target_x", "unit": "m", "quantity": "position", "axis": "x", "frame": "base_link"}
+    return {"observation": [joint, target], "action": [joint], "control_rate_hz": 30}
+```"""
 
 GENERATED = {
     "cli.md": command_line,

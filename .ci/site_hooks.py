@@ -1,14 +1,13 @@
-"""MkDocs hooks: the order of the navigation, the page of the HTTP API, and every public name on its page."""
+"""MkDocs hooks: the navigation, README's table on the first page, the HTTP API's page, every public name on a page."""
 
 from __future__ import annotations
 
+import re
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from mkdocs.exceptions import PluginError
-from mkdocs.plugins import event_priority
 
 import rlservo
 from rlservo.serve_app.protocols.asgi_app import create_app
@@ -16,7 +15,15 @@ from rlservo.serve_app.protocols.openapi import openapi
 from rlservo.serve_app.protocols.pages import files_of_swagger_ui
 from rlservo.serve_app.server.settings import ServerSettings
 
-SECTIONS = {"tutorial": "Tutorial", "how-to": "How-to", "reference": "Reference", "explanation": "Explanation"}
+GUIDES = {  # MkDocs warns of a page that is in none
+    "Train and export": "your-own-environment train export sources compile",
+    "Serve": "serve recurrent-policies versions ray-and-kubernetes",
+    "Drive": "control-loop cockpit disturb robo-gym ros2 ur-arm",
+    "Operate": "operate secure compose-and-tls object-storage",
+    "Learn": "record-and-replay learn learn-online",
+}
+README = Path(__file__).parents[1] / "README.md"
+TABLE = "<!-- README's table -->"  # on the first page
 PYTHON_PAGE = "reference/python.md"
 NOT_OBJECTS = {"__version__", "errors"}  # errors has a page of its own
 OPENAPI_PAGE = """<!DOCTYPE html>
@@ -32,35 +39,29 @@ SwaggerUIBundle({spec: %s, dom_id: "#swagger-ui", validatorUrl: null, supportedS
 """
 
 
-ROOT = Path(__file__).resolve().parents[1]
-FOLDERS = ("envs", "export", "serve_app", "deploy")
-PACKAGE = tempfile.TemporaryDirectory(prefix="rlservo-site-")  # removed with the process
-
-
-@event_priority(100)  # before mkdocstrings reads it
-def on_config(config: Any) -> Any:
-    """Show mkdocstrings the folders under the names they are imported by."""
-    package = Path(PACKAGE.name, "rlservo")
-    package.mkdir(exist_ok=True)
-    for folder in FOLDERS:
-        (package / folder).symlink_to(ROOT / folder)
-    (package / "__init__.py").symlink_to(ROOT / "deploy" / "package" / "__init__.py")
-    config.plugins["mkdocstrings"].config.handlers["python"]["paths"] = [PACKAGE.name]
-    return config
-
-
 def on_files(files: Any, config: Any) -> Any:
-    """Give every page a place: those beside the home page first, then the sections."""
+    """Give every page a place: the guides by what they are for, the others by their folder."""
     pages = sorted(file.src_uri for file in files.documentation_pages())
-    top = [page for page in pages if "/" not in page and page != "index.md"]
-    config.nav = [{"Home": "index.md"}, *top]
-    for folder, title in SECTIONS.items():
-        config.nav.append({title: [page for page in pages if page.startswith(f"{folder}/")]})
+    config.nav = [{"Home": "index.md"}, {"Tutorial": "tutorial/first-robot.md"}]
+    config.nav += [{title: [f"how-to/{name}.md" for name in names.split()]} for title, names in GUIDES.items()]
+    for title in ("Reference", "Explanation"):
+        config.nav.append({title: [page for page in pages if page.startswith(f"{title.lower()}/")]})
     text = Path(config.docs_dir, PYTHON_PAGE).read_text(encoding="utf-8")
     missing = [name for name in rlservo.__all__ if name not in NOT_OBJECTS and f"::: rlservo.{name}\n" not in text]
     if missing:
         raise PluginError(f"{PYTHON_PAGE} does not document {', '.join(missing)}")
     return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Put README's table of tasks on the first page, with links from there."""
+    if page.file.src_uri != "index.md":
+        return markdown
+    table = README.read_text(encoding="utf-8").partition("## I want to ...\n\n")[2].partition("\n\n")[0]
+    table = re.sub(r"\[([^]]+)\]\((?!docs/)[^)]+\)", r"\1", table).replace("](docs/", "](")  # the others are not here
+    if markdown.count(TABLE) != 1 or not table.startswith("|"):
+        raise PluginError("index.md has no place for README's table, or README no table")
+    return markdown.replace(TABLE, table)
 
 
 def on_post_build(config: Any) -> None:

@@ -1,15 +1,13 @@
 """Coverage of estimates' intervals: how often those from repeated recordings contain the true return.
 
 Each repetition records episodes with one policy that explores, and estimates the return of others, whose true returns
-come from many episodes of their own; by importance sampling, or `--fitted` by fitted Q evaluation for policies that do
-not explore. Repetition i has the seed FIRST_SEED + i: seeds below 1000 were used when the limits of the estimates were
-chosen. Worlds: CartPole; `linear`, a point pulled to 0, always fitted; and with `--bundle` the simulated UR5, whose
-candidates move the mean of that policy's actions by a part of their spread, or change the spread.
+come from many episodes of their own. Repetition i has the seed FIRST_SEED + i: seeds below 1000 were used when the
+limits of the estimates were chosen. Worlds: CartPole; and with `--bundle` the simulated UR5, whose candidates move the
+mean of that policy's actions by a part of their spread, or change the spread.
 
     python benchmarks/estimates.py
-    python benchmarks/estimates.py --world linear --episodes 100
     rlservo export examples/checkpoints/ur5_positioning --out policies --name ur5    # then half an hour:
-    python benchmarks/estimates.py --bundle policies/ur5 [--fitted]
+    python benchmarks/estimates.py --bundle policies/ur5
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,10 +24,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.log_probability import log_probability
-from rlservo.serve_app.replay.estimate import Estimate, Trajectory, fitted_estimate, importance_sampling
-from rlservo.serve_app.runtime.exploration import draw_action
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.bundle.log_probability import log_probability
+from rlservo.policy.exploration import draw_action
+from rlservo.policy.policy import Policy
+from rlservo.recording.replay.estimate import Estimate, Trajectory, importance_sampling
 
 FIRST_SEED, TRUTH_SEED = 1000, 10**6
 Array = NDArray[np.float64]
@@ -85,20 +83,11 @@ def linear(gain: float, shift: float = 0.0) -> Probability:
     return lambda obs: 1 / (1 + np.exp(-gain * (obs @ DIRECTION + shift)))
 
 
-def greedy(direction: Sequence[float]) -> Probability:
-    return lambda obs: (obs @ np.array(direction) > 0).astype(np.float64)
-
-
-def cartpole(episodes: int, fitted: bool) -> World:
+def cartpole(episodes: int) -> World:
     policies = {
         "the recorded policy": linear(BEHAVIOUR), "gain 1.1": linear(1.1), "gain 1.3": linear(1.3),
         "gain 1.6": linear(1.6), "gain 2": linear(2.0), "gain 4": linear(4.0), "gain 1, leaning": linear(1.0, 0.2),
     }  # fmt: skip
-    if fitted:
-        policies = {
-            "greedy": greedy(DIRECTION.tolist()), "greedy, angle only": greedy([0, 0, 1, 0]),
-            "greedy, angle and its speed": greedy([0, 0, 1, 1]),
-        }  # fmt: skip
     candidates = [Candidate(name, policy) for name, policy in policies.items()]
     for candidate in candidates:
         candidate.truth = float(balance(candidate.policy, TRUTH_EPISODES, TRUTH_SEED)[2].mean())
@@ -137,55 +126,10 @@ def balance(probability: Probability, episodes: int, seed: int) -> tuple[Array, 
 
 def pushes(rows: Array, taken: NDArray[np.int64], policy: Probability) -> Trajectory:
     """Return an episode as the estimate of a policy reads it."""
-    one_hot, right, known = np.eye(2, dtype=np.float32), policy(rows), linear(BEHAVIOUR)(rows)
+    right, known = policy(rows), linear(BEHAVIOUR)(rows)
     with np.errstate(divide="ignore"):
         weights = np.log(np.where(taken == 1, right, 1 - right)) - np.log(np.where(taken == 1, known, 1 - known))
-    chosen = one_hot[(right > 0.5).astype(np.int64)]
-    return Trajectory(np.ones(len(rows)), weights, rows.astype(np.float32), one_hot[taken], chosen)
-
-
-# A point that earns -x^2 at x and moves by half its action: a policy is (noise of the recorded one, gain).
-
-LINEAR_GAIN, LINEAR_STEPS = 0.5, 10  # of the recorded policy
-
-
-def point(episodes: int) -> World:
-    """Return policies that pull harder or weaker than the recorded one, which explores by noise.
-
-    They differ from that of the tests (noise 0.5, pulls harder by 0.2), on which the method was tuned.
-    """
-    candidates = [
-        Candidate(f"recorded with noise {noise:g}, gain {LINEAR_GAIN + shift:g}", (noise, LINEAR_GAIN + shift))
-        for noise, shift in [(0.5, 0.2), (0.5, 0.0), (0.5, -0.3), (0.5, 0.5), (0.2, 0.2), (0.2, -0.1)]
-    ]
-    for candidate in candidates:
-        truth, _ = pull(candidate.policy[1], 0.0, 10 * TRUTH_EPISODES, TRUTH_SEED)
-        candidate.truth = float(-(truth**2).sum(axis=1).mean())
-
-    def record(seed: int) -> Callable[[Candidate], list[Trajectory]]:
-        def trajectories(candidate: Candidate) -> list[Trajectory]:
-            noise, gain = candidate.policy
-            return [
-                Trajectory(-(x**2), None, *(rows[:, None].astype(np.float32) for rows in (x, action, -gain * x)))
-                for x, action in zip(*pull(LINEAR_GAIN, noise, episodes, seed), strict=True)
-            ]
-
-        return trajectories
-
-    return World(candidates, record)
-
-
-def pull(gain: float, noise: float, episodes: int, seed: int) -> tuple[Array, Array]:
-    """Return (positions, actions) `[episodes, steps]`."""
-    rng = np.random.default_rng(seed)
-    position = rng.normal(size=episodes)
-    positions, actions = [], []
-    for _ in range(LINEAR_STEPS):
-        action = -gain * position + noise * rng.normal(size=episodes)
-        positions.append(position)
-        actions.append(action)
-        position = position + 0.5 * action + 0.05 * rng.normal(size=episodes)
-    return np.array(positions).T, np.array(actions).T
+    return Trajectory(np.ones(len(rows)), weights)
 
 
 # The UR5: a policy is the shipped one, its mean moved by so many standard deviations, and their logarithm by so much.
@@ -199,28 +143,22 @@ VARIANTS: dict[str, Variant] = {
     "spread 2% smaller": (0.0, -0.02),
     "mean moved by 0.3 of the spread": (0.3, 0.0),
 }
-DETERMINISTIC: dict[str, Variant] = {  # with e^-20 of the spread
-    "the mode": (0.0, -20.0),
-    "the mode moved by 0.3 of the spread": (0.3, -20.0),
-    "the mode moved by the spread": (1.0, -20.0),
-}
-Step = tuple[float, Array, NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
-"""Reward, logarithms of the weights `[VARIANTS]`, observation, action, actions `[DETERMINISTIC, elements]`."""
+Step = tuple[float, Array]
+"""Reward, and logarithms of the weights `[VARIANTS]`."""
 
 
 def arm(policy: Policy, args: argparse.Namespace) -> World:
-    variants = DETERMINISTIC if args.fitted else VARIANTS
-    candidates = [Candidate(name, index) for index, name in enumerate(variants)]
-    for candidate, variant in zip(candidates, variants.values(), strict=True):
+    candidates = [Candidate(name, index) for index, name in enumerate(VARIANTS)]
+    for candidate, variant in zip(candidates, VARIANTS.values(), strict=True):
         candidate.truth = mean_return(drive(policy, variant, args.truth, TRUTH_SEED))
         print(f"{candidate.name}: true return {candidate.truth:.3f}", flush=True)
     recorded = drive(policy, (0.0, 0.0), args.episodes * args.repetitions, 0)
-    if not args.fitted:  # more episodes than above (one recording is a hundredth of them) give a better truth
-        candidates[0].truth = mean_return(recorded)
+    # More episodes than above (one recording is a hundredth of them) give a better truth.
+    candidates[0].truth = mean_return(recorded)
 
     def record(seed: int) -> Callable[[Candidate], list[Trajectory]]:
         episodes = recorded[(seed - args.first_seed) * args.episodes :][: args.episodes]
-        return lambda candidate: [trajectory_of(one, candidate.policy, args.fitted) for one in episodes]
+        return lambda candidate: [trajectory_of(one, candidate.policy) for one in episodes]
 
     return World(candidates, record)
 
@@ -229,11 +167,9 @@ def mean_return(episodes: list[list[Step]]) -> float:
     return float(np.mean([sum(reward for reward, *_ in one) for one in episodes]))
 
 
-def trajectory_of(steps: list[Step], variant: int, fitted: bool) -> Trajectory:
-    rewards, weights, obs, actions, chosen = map(np.array, zip(*steps, strict=True))
-    return Trajectory(
-        rewards, None if fitted else weights[:, variant], obs, actions, chosen[:, variant if fitted else 0]
-    )
+def trajectory_of(steps: list[Step], variant: int) -> Trajectory:
+    rewards, weights = map(np.array, zip(*steps, strict=True))
+    return Trajectory(rewards, weights[:, variant])
 
 
 def move(inputs: NDArray[Any], variant: Variant) -> Array:
@@ -260,17 +196,11 @@ def drive(policy: Policy, variant: Variant, episodes: int, first_seed: int) -> l
             for other in (variant, *VARIANTS.values())
         )
         ratios = np.stack(moved, axis=1) - own[:, None]
-        modes = [
-            draw_action(move(inputs, other), contract.distribution, contract.action_space, rng).action["action"]
-            for other in DETERMINISTIC.values()
-        ]
         still, following_obs = [], []
         for row, (env, episode, number) in enumerate(arms):
             action = drawn.action["action"][row]
             obs, reward, terminated, truncated, _ = env.step(action)
-            chosen = np.stack([mode[row] for mode in modes])
-            arrays = [np.asarray(array, np.float32) for array in (seen[row], action, chosen)]
-            episode.append((float(reward), ratios[row], arrays[0], arrays[1], arrays[2]))
+            episode.append((float(reward), ratios[row]))
             if terminated or truncated:
                 following = next(waiting, None)
                 if following is None:
@@ -286,26 +216,22 @@ def drive(policy: Policy, variant: Variant, episodes: int, first_seed: int) -> l
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--world", choices=["cartpole", "linear"], default="cartpole")
     parser.add_argument("--bundle", type=Path, help="the UR5's policy, for its world")
-    parser.add_argument("--fitted", action="store_true", help="fitted Q evaluation, and not importance sampling")
     parser.add_argument("--episodes", type=int, default=600, help="in each recording")
     parser.add_argument("--repetitions", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
     parser.add_argument("--truth", type=int, default=4000, help="UR5: episodes for each candidate's true return")
     args = parser.parse_args()
-    args.fitted |= args.world == "linear"
     if args.bundle is not None:
         with Policy.load(args.bundle) as policy:
             world = arm(policy, args)
     else:
-        world = point(args.episodes) if args.world == "linear" else cartpole(args.episodes, args.fitted)
+        world = cartpole(args.episodes)
     for repetition in range(args.repetitions):
         recording = world.record(args.first_seed + repetition)
         for candidate in world.candidates:
             made, rng = recording(candidate), np.random.default_rng(args.first_seed + repetition)
-            estimates = [fitted_estimate(made, 1.0, rng)] if args.fitted else importance_sampling(made, 1.0, rng)
-            for estimate in estimates:
+            for estimate in importance_sampling(made, 1.0, rng):
                 candidate.count(estimate)
         if (repetition + 1) % 10 == 0:
             print(f"{repetition + 1} of {args.repetitions} repetitions estimated", flush=True)

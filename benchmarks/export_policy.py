@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from measuring import CPU, WALL, alternate, column, median_ratio, parser, rate, show, write
 
-from rlservo.export.contract.bundle import load_bundle
-from rlservo.export.contract.ort_session import open_ort_session
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.bundle.bundle import load_bundle
+from rlservo.policy.ort_session import open_ort_session
+from rlservo.policy.policy import Policy
 
 CHECKPOINT = Path(__file__).resolve().parent.parent / "examples" / "checkpoints" / "ur5_positioning"
 MOST_SECONDS = 8.0  # issue 3's targets

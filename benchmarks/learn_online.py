@@ -39,7 +39,7 @@ import yaml
 
 import rlservo
 from rlservo import errors
-from rlservo.serve_app.rollout.disturbance import disturb_env, parse_disturbance
+from rlservo.drive.disturbance import disturb_env, parse_disturbance
 from rlservo.serve_app.server.api_keys import new_key
 
 ENV = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"

@@ -27,7 +27,7 @@ import numpy as np
 from measuring import CPU, WALL, column, parser, rate, show, write
 
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
-from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
+from rlservo.envs.robot_server.robo_gym_messages import ROBOT_SERVER, Action, Empty, State, Success
 
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 START = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)

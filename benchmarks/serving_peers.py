@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.bundle import ONNX_FILE, load_bundle
-from rlservo.serve_app.wire.msgpack_arrays import pack
+from rlservo.bundle.bundle import ONNX_FILE, load_bundle
+from rlservo.client.formats.msgpack_arrays import pack
 
 PEERS = Path(__file__).resolve().parent / "peers"
 OURS, BARE, OURS_ON_RAY, BARE_ON_RAY = "rlservo serve", "bare uvicorn ASGI", "rlservo on Ray Serve", "bare on Ray Serve"
@@ -68,14 +68,16 @@ class Peer:
     checks: bool = True  # whether it answers with the policy's action
 
     def request(self, case: Case, port: int) -> bytes:
-        """Return the HTTP request of one observation, as a robot's client sends it: float32 numbers in full."""
-        obs = [float(str(value)) for value in case.obs]
-        document: object = {self.key: obs}
+        """Return the HTTP request of one observation with the fields and headers that `PolicyClient` sends."""
+        obs = [float(str(value)) for value in case.obs]  # float32 numbers in full
+        document: object = {self.key: obs, "seq": 4711, "deadline_ms": 4999.87654321}
         if self.path.endswith("/infer"):
             tensor = {"name": "obs", "shape": [1, len(obs)], "datatype": "FP32", "data": obs}
             document = {"inputs": [tensor]}
         body = json.dumps(document).encode()
         head = f"POST {self.path} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Type: application/json\r\n"
+        head += "Accept: application/json\r\nAccept-Encoding: identity\r\nUser-Agent: rlservo-client\r\n"
+        head += "X-Session-Id: 1f0e9d8c7b6a5948\r\n"
         return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body
 
 
@@ -84,11 +86,9 @@ Make = Callable[[Case, int, Path], Peer]
 
 def _ours(case: Case, port: int, _folder: Path) -> Peer:
     command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(case.policies), "--port", str(port)]
-    name = case.bundle.parent.name
-    return Peer(
-        command, f"/v1/policies/{name}/act", stream=f"/v1/policies/{name}/stream", message=pack({"obs": case.obs}),
-        greets=True, rounds=5,
-    )  # fmt: skip
+    name, message = case.bundle.parent.name, pack({"obs": case.obs, "seq": 4711, "deadline_ms": 4999.87654321})
+    paths = f"/v1/policies/{name}/act", f"/v1/policies/{name}/stream"
+    return Peer(command, paths[0], stream=paths[1], message=message, greets=True, rounds=5)
 
 
 def _bare(case: Case, port: int, _folder: Path) -> Peer:

@@ -31,7 +31,7 @@ import yaml
 from measuring import parser
 
 import rlservo
-from rlservo.serve_app.rollout.report import wilson_interval
+from rlservo.drive.success import wilson_interval
 
 VARIANTS = Path(__file__).resolve().parent / "variants"
 FIRST_SEED = 60_000

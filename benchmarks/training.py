@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 import shared.training_run as training_run
 from measuring import parser, write
 
-from rlservo.export.contract.errors import RlservoError
+from rlservo.errors import RlservoError
 from rlservo.export.rllib.batched_connectors import use_batched_connectors
 
 UR5 = "rlservo.envs:rlservo/EndEffectorPositioningURSim-v0"

@@ -27,12 +27,13 @@ from rlservo.deploy.commands.policy import policy
 from rlservo.deploy.commands.promote import promote
 from rlservo.deploy.commands.publish import publish
 from rlservo.deploy.commands.replay import estimate, replay
+from rlservo.deploy.commands.robot_check import robot_check
 from rlservo.deploy.commands.robot_server import robot_latency, robot_server, server_manager, ur_controller
 from rlservo.deploy.commands.rollout import rollout
 from rlservo.deploy.commands.ros2 import ros2, ros2_sim
 from rlservo.deploy.commands.serve import serve
 from rlservo.deploy.commands.verify import verify
-from rlservo.export.contract.errors import RlservoError, UsageError
+from rlservo.errors import RlservoError, UsageError
 
 app = typer.Typer(
     name="rlservo",
@@ -87,6 +88,7 @@ for command in (
     cockpit,
     server_manager,
     ur_controller,
+    robot_check,
     robot_latency,
     ros2_sim,
     replay,

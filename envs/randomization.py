@@ -18,7 +18,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.envs.disturbances import (
+from rlservo.bundle.environment_id import plain_id
+from rlservo.robots.disturbable import (
     MAX_MODEL_ERROR,
     CarriesPayload,
     Extreme,
@@ -28,7 +29,6 @@ from rlservo.envs.disturbances import (
     HasRobotModels,
     HasSensorErrors,
 )
-from rlservo.export.contract.environment_id import plain_id
 
 Range = tuple[float, float]
 Array = NDArray[np.float32]

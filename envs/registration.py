@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from gymnasium.envs.registration import register, registry
 
-from rlservo.export.contract.environment_id import NAMESPACE
+from rlservo.bundle.environment_id import NAMESPACE
 
 ENTRY_POINTS = {
     "EndEffectorPositioningURSim-v0": "rlservo.envs.ur.end_effector_positioning:EndEffectorPositioningURSim",

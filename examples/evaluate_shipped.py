@@ -25,7 +25,8 @@ import yaml
 from shared.help_text import DefaultsFormatter
 
 import rlservo
-from rlservo.serve_app.rollout.report import EpisodeRow, wilson_interval
+from rlservo.drive.report import EpisodeRow
+from rlservo.drive.success import SuccessRate, success_rates
 
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
 EPISODES, SEED = 500, 20_000
@@ -66,32 +67,33 @@ def evaluate(
     notify: Callable[[str], None] = lambda line: None,
 ) -> list[Evaluation]:
     """Run every evaluation of the settings with a loaded policy."""
-    evaluations = []
+    reports, outcomes = [], []
     for setting in settings["evaluation"]:
         notify(f"{episodes} episodes: {setting['start']}")
-        env_config = setting.get("env_config", {})
-        report = rlservo.rollout(policy, settings["env"], episodes=episodes, seed=seed, env_kwargs=env_config)
+        arguments, threshold = setting.get("env_config", {}), setting.get("success_return")
+        report = rlservo.rollout(policy, settings["env"], episodes=episodes, seed=seed, env_kwargs=arguments)
         if report.interrupted:
             raise KeyboardInterrupt
-        evaluations.append(_summarise(setting, env_config, report.episodes, seed))
-    return evaluations
+        reports.append(report.episodes)
+        outcomes.append(
+            [row.success if threshold is None else row.episode_return >= threshold for row in report.episodes]
+        )
+    figures = zip(settings["evaluation"], reports, success_rates(*outcomes), strict=True)
+    return [_summarise(setting, rows, success, seed) for setting, rows, success in figures]
 
 
 def _summarise(
-    setting: Mapping[str, Any], env_config: dict[str, Any], rows: tuple[EpisodeRow, ...], seed: int
+    setting: Mapping[str, Any], rows: tuple[EpisodeRow, ...], success: SuccessRate | None, seed: int
 ) -> Evaluation:
-    threshold = setting.get("success_return")
-    outcomes = [row.success if threshold is None else row.episode_return >= threshold for row in rows]
-    successes = None if None in outcomes else sum(bool(success) for success in outcomes)
     returns = np.array([row.episode_return for row in rows])
     margin = 1.96 * returns.std(ddof=1) / len(rows) ** 0.5 if len(rows) > 1 else float("nan")
     return Evaluation(
         start=setting["start"],
-        env_config=env_config,
+        env_config=setting.get("env_config", {}),
         episodes=len(rows),
         seed=seed,
-        successes=successes,
-        success_interval=None if successes is None else wilson_interval(successes, len(rows)),
+        successes=success and success.successes,
+        success_interval=success and success.interval,
         mean_return=float(returns.mean()),
         return_interval=(float(returns.mean() - margin), float(returns.mean() + margin)),
         worst_return=float(returns.min()),

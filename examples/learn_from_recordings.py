@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -38,6 +39,7 @@ from shared.help_text import DefaultsFormatter
 from shared.recorded_episodes import Choice, Recorded, RecordedEpisodes, read_recordings
 
 from rlservo import errors
+from rlservo.deploy.learning.rllib_episodes import through_connectors
 from rlservo.deploy.terminal import status
 from rlservo.export.checkpoints.location import (
     ENV_TO_MODULE,
@@ -47,9 +49,8 @@ from rlservo.export.checkpoints.location import (
     locate_checkpoint,
 )
 from rlservo.export.rllib import private_names
-from rlservo.serve_app.learning.rllib_episodes import through_connectors
-from rlservo.serve_app.recording.conversion.common import gym_space
-from rlservo.serve_app.recording.reader import Recording
+from rlservo.recording.conversion.common import gym_space
+from rlservo.recording.reader import Recording
 
 assert ray_settings
 ALGORITHMS = ("BC", "MARWIL", "CQL", "IQL")
@@ -121,6 +122,21 @@ def start_from(checkpoint: Path, recorded: Recorded) -> Start:
             f"--from {checkpoint}: its actions are {module_to_env.input_action_space}, the recordings have {done}"
         )
     return Start(env_to_module, module_to_env, RLModule.from_checkpoint(str(files.module)), files.module)
+
+
+def keep_connectors(config: AlgorithmConfig, start: Start) -> None:
+    """Make the configuration build a checkpoint's connectors, as RLlib restores by the configuration alone."""
+
+    def build(pipeline: Any) -> Callable[..., list[Any]]:
+        pieces = [(type(piece), *piece.get_ctor_args_and_kwargs()) for piece in pipeline.connectors]
+        return lambda *_: [kind(*args, **kwargs) for kind, args, kwargs in pieces]
+
+    config.env_runners(
+        env_to_module_connector=cast(Any, build(start.env_to_module)),
+        module_to_env_connector=cast(Any, build(start.module_to_env)),
+        add_default_connectors_to_env_to_module_pipeline=False,
+        add_default_connectors_to_module_to_env_pipeline=False,
+    )
 
 
 def start_anew(config: AlgorithmConfig, recorded: Recorded, with_filter: bool) -> Start:
@@ -196,11 +212,11 @@ def configure(args: argparse.Namespace, recorded: Recorded) -> tuple[AlgorithmCo
             moving_average_sqd_adv_norm_start=float(np.var(returns)) or 1.0,
             moving_average_sqd_adv_norm_update_rate=0.01,
         )
-    start = (
-        start_from(args.start, recorded)
-        if args.start
-        else start_anew(config, recorded, args.observation_filter == "MeanStdFilter")
-    )
+    if args.start:
+        start = start_from(args.start, recorded)
+        keep_connectors(config, start)
+    else:
+        start = start_anew(config, recorded, args.observation_filter == "MeanStdFilter")
     action_space = start.module_to_env.input_action_space or gym_space(recorded.contract.action_space)
     origin = recorded.contract.provenance  # no environment is made: an export names its elements by it
     config.environment(

@@ -37,9 +37,9 @@ from shared.resources import Room
 from shared.training_run import RETURN, STEPS, Run
 
 from rlservo import errors
-from rlservo.export.contract.environment_id import importing_id
+from rlservo.bundle.environment_id import importing_id
+from rlservo.drive.make_environment import make_env
 from rlservo.export.rllib.batched_connectors import supports, use_batched_connectors
-from rlservo.serve_app.rollout.environment import make_env
 
 ONLINE = ("PPO", "APPO", "IMPALA", "DQN", "SAC")
 ACTIONS: dict[str, tuple[type, ...]] = {"DQN": (Discrete,), "SAC": (Box, Discrete)}
@@ -288,7 +288,7 @@ def algorithm_config(
             replay_buffer_config={"type": "EpisodeReplayBuffer"}
         )  # the prioritised one has no sequences
     config.callbacks(
-        on_episode_end=training_run.log_success,
+        on_episode_end=training_run.SuccessLog(),
         on_train_result=training_run.fill_return(args.metric, args.mode),
     )
     if args.output:

@@ -49,8 +49,9 @@ from shared.imitation import Imitation, fit_to_solution
 from shared.training_run import build, iterate, main_with_sentences, ray_session
 
 from rlservo import Policy, errors, export_checkpoint
-from rlservo.envs.disturbances import HasExtremes
+from rlservo.drive.success import success_of
 from rlservo.export.rllib.batched_connectors import use_batched_connectors
+from rlservo.robots.disturbable import HasExtremes
 
 assert ray_settings
 SHIPPED = Path(__file__).resolve().parent / "checkpoints"
@@ -178,7 +179,7 @@ class ChosenEpisodes(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = super().step(action)
-        has_failed = (terminated or truncated) and not info.get("is_success", True)
+        has_failed = (terminated or truncated) and success_of(info) is False
         if has_failed and not self._is_out_of_reach:  # in which no policy succeeds
             self._failed.append(self._episode)
         return observation, reward, terminated, truncated, {**info, "is_ordinary": self._is_ordinary}
@@ -275,8 +276,8 @@ def log_episode(*, episode: Any, metrics_logger: Any, prev_episode_chunks: Any =
     info = episode.get_infos(-1) or {}
     if not info.get("is_ordinary", True):
         return  # the curve counts only the episodes that the environment draws
-    success, judgements = info.get("is_success", False), "is_success" in info
-    for key, value in zip(SUMS, (1, judgements, total, length, success), strict=True):
+    outcome = success_of(info)
+    for key, value in zip(SUMS, (1, outcome is not None, total, length, bool(outcome)), strict=True):
         metrics_logger.log_value(("shipped", key), float(value), reduce="sum")
 
 

@@ -26,7 +26,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import rlservo
-from rlservo.serve_app.rollout.report import render_report
+from rlservo.drive.report import render_report
 
 SETTINGS = Path(__file__).resolve().parent / "checkpoints" / "ur5_positioning" / "training.yaml"
 NAME = "ur5-sb3"

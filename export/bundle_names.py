@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, version_key
-from rlservo.export.contract.errors import UsageError
+from rlservo.bundle.contract import NAME_PATTERN, VERSION_PATTERN, version_key
+from rlservo.errors import UsageError
 
 
 def default_name(env_id: str | None, env_config: Mapping[str, Any], root: Path) -> str:

@@ -23,11 +23,7 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 import rlservo
-from rlservo.export.bundle_names import bundle_name, check_names, choose_target, default_name
-from rlservo.export.checkpoints.facts import CheckpointFacts
-from rlservo.export.checkpoints.remote import fetch, is_uri
-from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.bundle import (
+from rlservo.bundle.bundle import (
     CONTRACT_KEY,
     ONNX_FILE,
     TORCHSCRIPT_FILE,
@@ -35,7 +31,7 @@ from rlservo.export.contract.bundle import (
     write_contract,
     write_golden,
 )
-from rlservo.export.contract.contract import (
+from rlservo.bundle.contract import (
     VALUE,
     Contract,
     Distribution,
@@ -44,21 +40,40 @@ from rlservo.export.contract.contract import (
     TensorSpec,
     contract_json,
 )
-from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, NoNetworkError, ParityError, UsageError
-from rlservo.export.contract.extras import require
-from rlservo.export.contract.spaces import leaf_specs
-from rlservo.export.element_names import read_elements
+from rlservo.bundle.spaces import leaf_specs
+from rlservo.errors import (
+    ActionError,
+    AgentsDifferError,
+    CheckpointError,
+    NoNetworkError,
+    ParityError,
+    RlservoError,
+    UsageError,
+)
+from rlservo.export.bundle_names import bundle_name, check_names, choose_target, default_name
+from rlservo.export.checkpoints.facts import CheckpointFacts
+from rlservo.export.checkpoints.remote import fetch, is_uri
+from rlservo.export.checkpoints.unpickle import user_code
+from rlservo.export.element_names import described_by, open_conventions, read_elements, with_conventions, with_rate
 from rlservo.export.graph.one_thread import one_thread
-from rlservo.export.proof.parity import GraphLoop, Reference, prove, record, record_perturbed, replay, ties
+from rlservo.export.proof.differences import Comparer, ties
+from rlservo.export.proof.parity import GraphLoop, prove, replay
+from rlservo.export.proof.reaching import reaching_batches
+from rlservo.export.proof.reference_checks import check_reference, check_repeatable
+from rlservo.export.proof.references import Reference, record
+from rlservo.export.proof.rounding import measure_rounding
 from rlservo.export.recipe.describe import baked_steps
 from rlservo.export.recipe.recipe import Recipe, loose_bounds
-from rlservo.export.recipe.runners import Inputs, Outputs, Runner
+from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
 from rlservo.export.recipe.to_contract import space_spec, state_spec
+from rlservo.export.recipe.trees import build, named_leaves
 from rlservo.export.sources.registry import find_source
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source
+from rlservo.extras import require
 
 if TYPE_CHECKING:
+    from rlservo.export.graph.policy_graph import PolicyGraph
     from rlservo.export.sources.restored_policy import RestoredPolicy
 
 logger = logging.getLogger(__name__)
@@ -95,6 +110,9 @@ class ExportOptions:
     notify: Notify
     progress: Notify
     reward: str = ""
+    env: str | None = None
+    env_kwargs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    conventions: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 def export_checkpoint(
@@ -112,6 +130,13 @@ def export_checkpoint(
     source: str | None = None,
     vecnormalize: str | Path | None = None,
     frame_stack: int = 1,
+    joint_order: Sequence[str] = (),
+    control_rate_hz: float | None = None,
+    action_range: tuple[float, float] | None = None,
+    outputs: Mapping[str, str] | None = None,
+    env: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    conventions: Mapping[str, str] | None = None,
     reward: str = "",
     notify: Notify = logger.warning,
     progress: Notify = silent,
@@ -119,27 +144,46 @@ def export_checkpoint(
     """Export one policy of a checkpoint to `out/<name>/<version>/`.
 
     `checkpoint` is a path that a source knows (docs/how-to/sources.md), or a URI of such a folder; `source` names the
-    source, by default recognised from the path. `name` defaults to the environment's (followed by the module's if there
-    are several), `version` to the next integer after the newest one present. `app_dir` holds the user's own classes, if
-    the checkpoint needs any. `value` False leaves out the value head, which other servers would compute for each
-    action: a third of a small policy's time. `untrained_filter` also exports an observation filter whose statistics are
-    empty, or only evaluation's. `vecnormalize` and `frame_stack` are for Stable-Baselines3: its observation statistics,
-    if they are not beside the model, and the number of frames it stacked. `reward` names the contract's reward
-    function, `module:function`. `notify` gets one sentence for each thing a person should know (by default they are
-    logged), `progress` what is being done.
+    source, by default recognised from the path. `name` defaults to the environment's (followed by the module's if
+    there are several), `version` to the next integer after the newest one present. `app_dir` holds the user's own
+    classes, if the checkpoint needs any. `value` False leaves out the value head, which other servers would compute
+    for each action: a third of a small policy's time. `untrained_filter` also exports an observation filter whose
+    statistics are empty, or only evaluation's. `vecnormalize` and `frame_stack` are for Stable-Baselines3: its
+    observation statistics, if they are not beside the model, and the number of frames it stacked. `joint_order` is
+    for Isaac Lab and mjlab: the robot's joints in its own order, if no file of the run has them. `control_rate_hz` is
+    the control rate, if none has it. For a given ONNX, `action_range` are bounds to clip every element of the action
+    to, and `outputs` says of an output that its name does not tell: `action`, `none`, or the input that gets it at
+    the next step. `env` is an environment whose `describe()`, called with `env_kwargs`, says what the elements are,
+    if the checkpoint does not; `conventions` says what no file does (`{"quaternion": "xyzw", "frame": "base",
+    "action": "relative"}`). `reward` names the contract's reward function, `module:function`. `notify` gets one
+    sentence for each thing a person should know (by default they are logged), `progress` what is being done.
 
     Raises UsageError for a name or version that cannot be used, CheckpointError or UnsupportedError when the checkpoint
     cannot be exported, ParityError when the graph does not give the trainer's own actions. Nothing is left behind then.
     """
     with fetch(checkpoint, progress) as local:
         chosen = find_source(Path(local), source, notify)
+        given = {
+            "--vecnormalize": vecnormalize, "--frame-stack": frame_stack != 1, "--joint-order": joint_order,
+            "--action-range": action_range, "--output": outputs,
+        }  # fmt: skip
+        if wrong := [option for option, value in given.items() if value and option not in chosen.options]:
+            raise UsageError(f"{wrong[0]} is not for {chosen.name} checkpoints: leave it out")
         files = chosen.locate(Path(local), module_id, agent_id)
         restore = RestoreOptions(
-            Path(app_dir), value, None if vecnormalize is None else Path(vecnormalize), frame_stack=frame_stack
+            Path(app_dir),
+            value,
+            None if vecnormalize is None else Path(vecnormalize),
+            frame_stack=frame_stack,
+            joint_order=tuple(joint_order),
+            control_rate_hz=control_rate_hz,
+            action_range=action_range,
+            outputs=outputs or {},
         )
         options = ExportOptions(
-            chosen, Path(out), name, version, description, restore, untrained_filter, notify, progress, reward
-        )
+            chosen, Path(out), name, version, description, restore, untrained_filter, notify, progress, reward,
+            env, env_kwargs or {}, conventions or {},
+        )  # fmt: skip
         return export_files([files], options, checkpoint)[0]
 
 
@@ -235,11 +279,17 @@ def _build(
     options.progress(f"restoring '{files.module_id}' (importing torch and {source.framework} takes seconds)")
     restored = source.restore(files, options.restore, options.notify)
     _check_filter(files, facts, restored, options)
-    for warning in loose_bounds(restored.recipe):
+    for warning in loose_bounds(restored.recipe, source.framework):
         options.notify(warning)
     elements = restored.elements
     if elements is None:
         elements = read_elements(facts.env_id, facts.env_config, restored.recipe, options.notify)
+    if options.env is not None:
+        elements = described_by(options.env, options.env_kwargs, restored.elements, restored.recipe)
+    elements = with_conventions(elements, options.conventions, restored.recipe)
+    elements = with_rate(elements, options.restore.control_rate_hz)
+    if left_open := open_conventions(elements):
+        options.notify(left_open)
     folder = folders.enter_context(_temporary_folder(target))
     with one_thread():
         labels = [] if isinstance(elements.action, Mapping) else [element.name for element in elements.action]
@@ -261,10 +311,11 @@ def _build(
             baked_in=baked_steps(recipe, restored.module_class, restored.network.module, sorted(unread)),
             control_rate_hz=elements.control_rate_hz,
             reward=options.reward,
-            provenance=_provenance(files, facts, restored, source),
+            provenance=_provenance(files, facts, restored, options),
             parity=parity,
         )
         _write_rest(folder, contract, inputs, outputs)
+        _answer_once(folder, recipe)
     return folder, ExportResult(target, contract)
 
 
@@ -312,10 +363,11 @@ def _write_graphs(
 
     Parts of the observation that nothing reads are not inputs.
     """
+    from rlservo.export.graph.eager_checks import check_eager
     from rlservo.export.graph.onnx_file import inputs_read, run_onnx, write_onnx
     from rlservo.export.graph.policy_graph import PolicyGraph
     from rlservo.export.graph.torchscript_file import run_torchscript, write_torchscript
-    from rlservo.export.proof.why_different import why_different
+    from rlservo.export.graph.unreached import unreached
 
     recipe, progress, framework = restored.recipe, options.progress, options.source.framework
     batches = draw_batches(recipe, SEED)
@@ -323,6 +375,10 @@ def _write_graphs(
     references = record(restored.start_loop, batches, framework)
     pair = next(batch for batch in batches if len(batch) == BATCH_SIZES[1])
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(len(pair), np.bool_))
+    eager = PolicyGraph(recipe, restored.network)
+    check_eager(eager, example)
+    comparer = comparer_of(restored, eager, references)
+    check_reference(restored.start_loop, recipe, references, comparer)
     progress("writing TorchScript and ONNX")
 
     def write(left_out: Collection[str]) -> tuple[PolicyGraph, list[str]]:
@@ -343,18 +399,42 @@ def _write_graphs(
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
     progress(f"proving both against {framework}'s actions")
-    perturb = partial(record_perturbed, restored.start_loop, references)
+    if reaching := reaching_batches(recipe, onnx, SEED):
+        references += record(restored.start_loop, reaching, framework)
+        comparer = comparer_of(restored, eager, references)
     try:
         runners = {"onnx": onnx, "torchscript": script}
-        parity = prove(recipe, references, runners, labels, options.source.reference, perturb)
+        parity = prove(recipe, references, runners, labels, restored.reference or options.source.reference, comparer)
     except ParityError as error:
-        if why := why_different(restored.start_loop, references, frozen):
-            raise ParityError(f"{error.message}; {why}", error.details) from error
+        if frozen:
+            raise ParityError(
+                f"{error.message}; tracing froze sizes that the network reads outside torch at {', '.join(frozen[:3])}",
+                error.details,
+            ) from error
         raise
-    inputs = _golden_inputs(recipe, references, onnx)
+    check_repeatable(restored.start_loop, references[:1])  # again, after seconds: a clock has moved
+    steps = [inputs for inputs, _ in replay(references, onnx, recipe.state)]
+    missed = unreached(graph, recipe, steps, [reference.outputs for reference in references], labels)
+    inputs = _golden_inputs(recipe, references, steps)
     outputs = onnx(inputs)
     ordered = {name: inputs[name] for name in graph.input_names}
+    parity = parity.model_copy(update={"unreached": tuple(missed)})
     return parity, ordered, {name: outputs[name] for name in graph.output_names}
+
+
+def comparer_of(restored: RestoredPolicy, eager: PolicyGraph, references: Sequence[Reference]) -> Comparer:
+    """Return how outputs are compared with references, given the policy's graph in torch."""
+    from rlservo.export.graph.last_bits import moved_weights, run_eager
+
+    measure = partial(
+        measure_rounding,
+        restored.start_loop,
+        restored.recipe,
+        references,
+        run_eager(eager),
+        partial(moved_weights, eager),
+    )
+    return Comparer(restored.recipe, references, measure)
 
 
 def _left_out(recipe: Recipe, read: Collection[str]) -> set[str]:
@@ -365,18 +445,19 @@ def _left_out(recipe: Recipe, read: Collection[str]) -> set[str]:
     return set(leaves - kept) if unread < leaves else set()
 
 
-def _golden_inputs(recipe: Recipe, references: list[Reference], run: Runner) -> Inputs:
+def _golden_inputs(recipe: Recipe, references: list[Reference], steps: Sequence[Inputs]) -> Inputs:
     """Return inputs of every kind; those where two choices tie stay out, as another machine may choose either.
 
-    For a policy with a state they are steps of sequences, each with its state.
+    `steps` are the graph's inputs for each reference: for a policy with a state each with its state.
     """
     pools: dict[str, list[Inputs]] = {kind: [] for kind in GOLDEN_SAMPLES}
     discrete = any(not isinstance(space, Box) for space in recipe.action_leaves.values())
     everything: list[Inputs] = []
-    for reference, (inputs, _) in zip(references, replay(references, run, recipe.state), strict=True):
+    for reference, inputs in zip(references, steps, strict=True):
         batch = reference.batch
         clear = ~ties(recipe, reference.outputs) if discrete else np.ones(len(batch), np.bool_)
-        pools[batch.kind].append({name: values[clear] for name, values in inputs.items()})
+        if batch.kind in pools:
+            pools[batch.kind].append({name: values[clear] for name, values in inputs.items()})
         everything.append(inputs)
     size = sum(values[0].nbytes for values in everything[0].values())
     chosen: list[Inputs] = []
@@ -405,9 +486,13 @@ def _tensor(name: str, values: NDArray[Any]) -> TensorSpec:
     return TensorSpec(name=name, dtype=str(values.dtype), shape=(-1, *values.shape[1:]))
 
 
-def _provenance(files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPolicy, source: Source) -> Provenance:
+def _provenance(
+    files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPolicy, options: ExportOptions
+) -> Provenance:
     from importlib.metadata import version
 
+    source, restore = options.source, options.restore
+    again = {"joint_order": restore.joint_order, "action_range": restore.action_range, "outputs": restore.outputs}
     return Provenance(
         algorithm=facts.algorithm,
         source=source.name,
@@ -417,6 +502,7 @@ def _provenance(files: PolicyFiles, facts: CheckpointFacts, restored: RestoredPo
         agents=restored.agents,
         module_class=restored.module_class,
         checkpoint_sha256=files.sha256(),
+        options={name: value for name, value in again.items() if value},
         training_iterations=facts.training_iterations,
         env_steps=facts.env_steps,
         env_id=facts.env_id,
@@ -440,3 +526,22 @@ def _write_rest(folder: Path, contract: Contract, golden_inputs: Inputs, golden_
     for name, values in outputs.items():
         if not np.array_equal(values, replayed[name], equal_nan=True):
             raise ParityError(f"the finished file's '{name}' is not what was proven: is the disk full or failing?")
+
+
+def _answer_once(folder: Path, recipe: Recipe) -> None:
+    """Load the finished bundle as its users will, and compare one action. Raises ParityError if it does not answer."""
+    from rlservo.export.graph.onnx_file import run_onnx
+
+    first = next(batch for batch in draw_batches(recipe, SEED) if batch.kind == "likely").row(0)
+    expected = GraphLoop(run_onnx(folder / ONNX_FILE), recipe.state).step(first.inputs, np.ones(1, np.bool_))
+    obs = build(recipe.observation_space, [first.inputs[name][0] for name in recipe.observation_leaves])
+    try:
+        with rlservo.Policy.load(folder) as policy:
+            action = named_leaves(policy.act(obs), "action")
+    except ActionError:  # outside of its bounds: a policy of whose actions `loose_bounds` has warned
+        return
+    except RlservoError as error:
+        raise ParityError(f"the finished bundle does not answer: {error.message}") from error
+    for name, leaf in action.items():
+        if not np.allclose(leaf, expected[name][0], rtol=1e-4, atol=1e-5, equal_nan=True):
+            raise ParityError(f"the finished bundle answers {name} = {leaf}, its graph {expected[name][0]}")

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rlservo.bundle.conventions import parse_elements
+from rlservo.bundle.spaces import Element
+from rlservo.errors import UsageError
 from rlservo.export.checkpoints.facts import CheckpointFacts
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.spaces import Element
 from rlservo.export.export_checkpoint import ExportOptions, ExportResult, export_files, silent
 from rlservo.export.sources.restored_policy import ElementNames
 from rlservo.export.sources.source import Notify, RestoreOptions
@@ -37,9 +38,9 @@ def export_policy(
     offset: float | NDArray[Any] | None = None,
     clip: bool = True,
     state: Mapping[str, ArrayLike] | None = None,
-    observation_names: Sequence[str] = (),
+    observation_names: Sequence[str | Mapping[str, Any]] = (),
     observation_units: Sequence[str] = (),
-    action_names: Sequence[str] = (),
+    action_names: Sequence[str | Mapping[str, Any]] = (),
     action_units: Sequence[str] = (),
     control_rate_hz: float | None = None,
     algorithm: str = "unknown",
@@ -53,7 +54,9 @@ def export_policy(
     choice `[batch, n]`. The robot gets `action * scale + offset`, with `clip` clipped to the space's bounds. A
     recurrent module takes one tensor `[batch, ...]` for each entry of `state` after the observation, and returns a
     tuple of the action and the next ones; the entries are what an episode starts with, without the batch axis. Names
-    and units are given for each element in row-major order. The module itself is not changed.
+    and units are given for each element in row-major order; in place of a name, a mapping says more, as an
+    environment's `describe()` does (`{"name": "target_qw", "quantity": "quaternion", "axis": "w", "frame": "base"}`).
+    The module itself is not changed.
 
     Raises UsageError for arguments that do not fit together, UnsupportedError for a module that cannot be traced or
     does not run on the space's observations, ParityError when the graph's results differ from the module's.
@@ -64,7 +67,7 @@ def export_policy(
         _elements("action", action_names, action_units),
         control_rate_hz,
     )
-    initial = {name: np.asarray(values, np.float32) for name, values in (state or {}).items()}
+    initial = {name: _initial(name, values) for name, values in (state or {}).items()}
     spec = ModuleSpec(observation_space, action_space, scale, offset, clip, initial, elements, facts)
     options = ExportOptions(
         TorchModule(spec), Path(out), name, version, description, RestoreOptions(Path()), False, notify, progress
@@ -72,7 +75,24 @@ def export_policy(
     return export_files([ModuleFiles(module)], options, name)[0]
 
 
-def _elements(which: str, names: Sequence[str], units: Sequence[str]) -> tuple[Element, ...]:
+def _initial(name: str, values: ArrayLike) -> NDArray[Any]:
+    given = np.asarray(values)
+    if isinstance(values, np.ndarray | np.generic) and given.dtype != np.float32:
+        raise UsageError(
+            f"the state '{name}' is {given.dtype}: a bundle carries states as float32, so give it and let the module "
+            "return it as float32"
+        )
+    return given.astype(np.float32)
+
+
+def _elements(which: str, names: Sequence[str | Mapping[str, Any]], units: Sequence[str]) -> tuple[Element, ...]:
     if units and len(units) != len(names):
         raise UsageError(f"{len(names)} {which} names and {len(units)} units were given: expected a unit for each name")
-    return tuple(Element(name=name, unit=unit) for name, unit in zip(names, units or [""] * len(names), strict=True))
+    described: list[Mapping[str, Any]] = [{"name": name} if isinstance(name, str) else name for name in names]
+    try:
+        return parse_elements(
+            {**one, "unit": unit or one.get("unit", "")}
+            for one, unit in zip(described, units or [""] * len(names), strict=True)
+        )
+    except ValueError as error:
+        raise UsageError(f"{which}_names: {error}") from error

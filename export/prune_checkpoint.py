@@ -10,12 +10,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from rlservo.errors import UsageError
 from rlservo.export.checkpoints.facts import read_facts
 from rlservo.export.checkpoints.location import FACTS_FILE, Files, locate_checkpoint
 from rlservo.export.checkpoints.old_location import RLLIB_FILE
 from rlservo.export.checkpoints.remote import fetch
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.errors import UsageError
 from rlservo.export.export_checkpoint import silent
 from rlservo.export.sources.source import PICKLES
 

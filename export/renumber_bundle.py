@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+from rlservo.bundle.bundle import CONTRACT_KEY, ONNX_FILE, Bundle, load_bundle, write_contract
+from rlservo.bundle.contract import contract_json
 from rlservo.export.bundle_names import check_names
-from rlservo.export.contract.bundle import CONTRACT_KEY, ONNX_FILE, Bundle, load_bundle, write_contract
-from rlservo.export.contract.contract import contract_json
 
 
 def renumber(bundle: Bundle, version: str, out: Path) -> Bundle:

@@ -15,8 +15,8 @@ from rich.console import Group, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rlservo.export.contract.contract import BakedStep, Contract, Evaluation, Parity, StateSpec
-from rlservo.export.contract.spaces import DiscreteSpec, LeafSpec, SpaceSpec, leaf_specs
+from rlservo.bundle.contract import BakedStep, Contract, Evaluation, Parity, StateSpec
+from rlservo.bundle.spaces import DiscreteSpec, LeafSpec, SpaceSpec, leaf_specs
 
 MANY = 64  # elements shown one by one; if there are more, only the first and the last few
 ENDS = 8
@@ -52,12 +52,16 @@ def export_report(contract: Contract) -> Text:
     trained = f"; training took {steps:,} environment steps" if steps is not None else ""
     seen = f"filter    statistics of {frozen.values['count']:,} observations{trained}\n" if frozen else ""
     framework = contract.provenance.framework.rpartition(" ")[0] or "RLlib"
+    if contract.provenance.source == "onnx":
+        framework += " on the given file (taken as given: no trainer was asked)"
+    unreached = contract.parity.unreached
+    unproven = f"\nunproven  never reached by a sample: {'; '.join(unreached)}" if unreached else ""
     return Text(
         f"policy    {contract.name} version {contract.version}\n"
         f"graph     {observation.size} observation elements to {outcome}{rate}\n"
         f"baked in  {', '.join(step.step for step in contract.baked_in)}\n"
         f"{seen}proven    {contract.parity.samples:,} observations; largest relative difference to {framework}: "
-        f"{differences}"
+        f"{differences}{unproven}"
     )
 
 

@@ -16,16 +16,21 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
+from rlservo.bundle.bundle import Bundle, load_bundle, write_contract
+from rlservo.bundle.contract import REWARD, Contract, Evaluation, Parity
+from rlservo.bundle.spaces import leaf_specs
+from rlservo.drive.control_loop import rollout
+from rlservo.drive.report import RolloutReport
+from rlservo.drive.success import success_rates
+from rlservo.errors import BundleError, UsageError, first_line
 from rlservo.export.checkpoints.remote import fetch, is_uri
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.bundle import Bundle, load_bundle, write_contract
-from rlservo.export.contract.contract import REWARD, Contract, Evaluation, Parity
-from rlservo.export.contract.errors import BundleError, UsageError, first_line
-from rlservo.export.contract.extras import require
-from rlservo.export.contract.spaces import leaf_specs
-from rlservo.export.export_checkpoint import TORCH, silent
+from rlservo.export.export_checkpoint import TORCH, comparer_of, silent
 from rlservo.export.graph.one_thread import one_thread
-from rlservo.export.proof.parity import GraphLoop, prove, record
+from rlservo.export.proof.parity import GraphLoop, prove
+from rlservo.export.proof.reaching import reaching_batches
+from rlservo.export.proof.reference_checks import check_reference
+from rlservo.export.proof.references import record
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.samples import draw_batches
@@ -33,8 +38,7 @@ from rlservo.export.recipe.to_contract import space_spec
 from rlservo.export.recipe.trees import build, named_leaves
 from rlservo.export.sources.registry import find_source
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source
-from rlservo.serve_app.rollout.control_loop import rollout
-from rlservo.serve_app.rollout.report import RolloutReport
+from rlservo.extras import require
 
 SEED = 20241  # not the export's: other observations
 
@@ -87,6 +91,9 @@ def verify_bundle(
             any(output.name == "value" for output in loaded.contract.outputs),
             None if vecnormalize is None else Path(vecnormalize),
             _frames(loaded.contract),
+            joint_order=tuple(origin.options.get("joint_order", ())),
+            action_range=tuple(origin.options["action_range"]) if "action_range" in origin.options else None,
+            outputs=origin.options.get("outputs", {}),
         )
         seeds = range(first_seed, first_seed + episodes)
         return _verify(loaded, origin_of, files, options, env_id, arguments, seeds, notify, progress)
@@ -107,14 +114,19 @@ def _verify(
     if not same:
         notify("the bundle was exported from another checkpoint: expect a difference")
     progress(f"importing torch and {source.framework}")
+    from rlservo.export.graph.policy_graph import PolicyGraph
+
     with user_code(options.app_dir) as folder, one_thread():
         restored = source.restore(files, replace(options, app_dir=folder), notify)
         _check_spaces(loaded.contract, restored.recipe)
         formats = _formats(loaded)
         labels = [element.name for element in loaded.contract.action_space.elements]
         progress(f"comparing both formats with {source.framework}'s actions")
-        references = record(restored.start_loop, draw_batches(restored.recipe, SEED), source.framework)
-        parity = prove(restored.recipe, references, formats, labels, source.reference)
+        batches = [*draw_batches(restored.recipe, SEED), *reaching_batches(restored.recipe, formats["onnx"], SEED)]
+        references = record(restored.start_loop, batches, source.framework)
+        comparer = comparer_of(restored, PolicyGraph(restored.recipe, restored.network), references)
+        check_reference(restored.start_loop, restored.recipe, references, comparer)
+        parity = prove(restored.recipe, references, formats, labels, restored.reference or source.reference, comparer)
         evaluation = None
         if env_id is not None:
             run, recipe = formats["onnx"], restored.recipe
@@ -177,14 +189,15 @@ def _rollout(policy: _LoopPolicy, env_id: str, arguments: Mapping[str, Any], see
 
 def _evaluation(bundle: RolloutReport, checkpoint: RolloutReport, seeds: range) -> Evaluation:
     assert bundle.return_mean is not None and checkpoint.return_mean is not None, "every episode was finished"
+    ours, theirs = success_rates(*([row.success for row in report.episodes] for report in (bundle, checkpoint)))
     return Evaluation(
         env_id=bundle.env_id,
         episodes=len(seeds),
         first_seed=seeds.start,
         return_bundle=bundle.return_mean,
         return_checkpoint=checkpoint.return_mean,
-        success_rate_bundle=bundle.success_rate,
-        success_rate_checkpoint=checkpoint.success_rate,
+        success_rate_bundle=ours and ours.rate,
+        success_rate_checkpoint=theirs and theirs.rate,
         evaluated_at=datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
     )
 

@@ -1,1 +1,1 @@
-"""Policies at work: in process (`runtime`), from a client (`client`), in a control loop, on a server."""
+"""Policy server: one application, run by uvicorn or by Ray Serve."""

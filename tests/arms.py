@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from rlservo.envs.ur_controller.controller import Controller, Sample
-from rlservo.envs.ur_controller.server import CannotListenError, ControllerServer
+from rlservo.robots.simulated.ur_controller.controller import Controller, Sample
+from rlservo.robots.simulated.ur_controller.controller_server import CannotListenError, ControllerServer
 
 PATIENCE_S = 60.0
 # Of a real arm in tests. The machine may be busy: the product's watchdog_hz is 10.

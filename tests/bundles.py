@@ -1,6 +1,6 @@
 """Small real bundles for the runtime and the server: an ONNX graph, TorchScript, golden vectors and hashes.
 
-They are written with only `onnx.helper` and `rlservo.export.contract.bundle`, so that these tests need no exporter.
+They are written with only `onnx.helper` and `rlservo.bundle.bundle`, so that these tests need no exporter.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from cache import cached, digest, versions
 from checkpoints import APP, TRAINED_WITH
-from rlservo.export.contract import bundle as bundle_files
-from rlservo.export.contract.contract import (
+from rlservo.bundle import bundle as bundle_files
+from rlservo.bundle.contract import (
     BakedStep,
     Contract,
     Distribution,
@@ -34,7 +34,7 @@ from rlservo.export.contract.contract import (
     StateSpec,
     TensorSpec,
 )
-from rlservo.export.contract.spaces import BoxSpec, DiscreteSpec, Element
+from rlservo.bundle.spaces import BoxSpec, DiscreteSpec, Element
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
@@ -177,7 +177,7 @@ def write_box_policy(
             dtype="float32",
             low=None if unbounded else tuple(-b for b in bounds),
             high=None if unbounded else bounds,
-            elements=tuple(Element(name=f"joint_{i}", unit="rad") for i in range(ACTIONS)),
+            elements=tuple(Element(name=f"joint_{i}", unit="rad", quantity="joint position") for i in range(ACTIONS)),
         ),
         inputs=(TensorSpec(name="obs", dtype="float32", shape=(-1, OBS)),),
         outputs=(
@@ -193,6 +193,28 @@ def write_box_policy(
     # Small golden observations keep the actions of an unclipped policy inside its space.
     obs = (rng.standard_normal((8, OBS)) * (0.05 if action_scale > 1 else 1.0)).astype(np.float32)
     return write_bundle(folder, contract, obs)
+
+
+def write_slow_policy(root: Path, *, version: str) -> Path:
+    """`write_box_policy` with a loop around nothing, which takes about a tenth of a second for each request."""
+    folder = write_box_policy(root, version=version)
+    model = onnx.load(folder / bundle_files.ONNX_FILE)
+    kinds = {"turn": TensorProto.INT64, "go_on": TensorProto.BOOL, "value": TensorProto.FLOAT}
+    infos = {
+        name + end: helper.make_tensor_value_info(name + end, kind, None if name == "value" else [])
+        for name, kind in kinds.items()
+        for end in ("", "_out")
+    }
+    nodes = [helper.make_node("Identity", [name], [f"{name}_out"]) for name in ("go_on", "value")]
+    inputs = [infos[name] for name in kinds]
+    body = helper.make_graph(nodes, "body", inputs, [infos["go_on_out"], infos["value_out"]])
+    for name, value in (("turns", 30_000), ("always", True)):
+        model.graph.initializer.append(numpy_helper.from_array(np.array(value), name))
+    next(node for node in model.graph.node if node.op_type == "Gemm").input[0] = "looped"
+    model.graph.node.insert(0, helper.make_node("Loop", ["turns", "always", "obs"], ["looped"], body=body))
+    onnx.save(model, folder / bundle_files.ONNX_FILE)
+    bundle_files.write_contract(folder, bundle_files.read_contract(folder))  # with the hashes of what is there now
+    return folder
 
 
 def write_discrete_policy(root: Path, *, name: str = "gridworld", version: str = "1", start: int = 0) -> Path:
@@ -330,13 +352,19 @@ def box_policy() -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
+def slow_policy() -> Callable[..., Path]:
+    """`write_slow_policy`."""
+    return write_slow_policy
+
+
+@pytest.fixture(scope="session")
 def discrete_policy() -> Callable[..., Path]:
     """`write_discrete_policy`."""
     return write_discrete_policy
 
 
 EXPORTED_WITH = versions("ray", "torch", "onnx", "onnxscript", "onnxruntime", "gymnasium", "numpy")
-PRODUCT = [ROOT / folder for folder in ("export", "serve_app", "envs")]  # what an export runs through
+PRODUCT = [ROOT / folder for folder in ("rlservo", "export", "envs")]  # what an export runs through
 
 
 @functools.cache

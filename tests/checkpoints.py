@@ -54,7 +54,9 @@ def trained(script: str) -> Path:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that need these checkpoints."""
     for item in items:
-        if {"zoo", "wide_zoo", "old_zoo", "layout_zoo", "reported_zoo"} & set(getattr(item, "fixturenames", ())):
+        if {"zoo", "wide_zoo", "old_zoo", "layout_zoo", "reported_zoo", "connector_zoo"} & set(
+            getattr(item, "fixturenames", ())
+        ):
             item.add_marker("trained")
 
 
@@ -86,3 +88,9 @@ def layout_zoo() -> Path:
 def reported_zoo() -> Path:
     """The same for what people brought and an export had refused."""
     return trained("train_reported_zoo.py")
+
+
+@pytest.fixture(scope="session")
+def connector_zoo() -> Path:
+    """The same for connectors of the user's own."""
+    return trained("train_connector_zoo.py")

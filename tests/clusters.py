@@ -21,7 +21,7 @@ import psutil
 import pytest
 import yaml
 
-from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.client.admin_client import AdminClient
 from rlservo.serve_app.server.api_keys import new_key
 from servers import free_ports
 from storages import RedisServer, running_redis

@@ -23,7 +23,7 @@ from PIL import Image
 
 from browser import browser_program
 from bundles import write_bundle
-from rlservo.export.contract import bundle as bundle_files
+from rlservo.bundle import bundle as bundle_files
 from servers import free_ports
 from waiting import PATIENCE_S, wait_for
 

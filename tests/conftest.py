@@ -48,11 +48,6 @@ pytest_plugins = [
 
 # Tests that share what is costly to make, by the beginning of their id. All others share their file's own.
 TOGETHER = {
-    # One after the other: each takes little of a core, and next to each other they leave the others no work to do.
-    "tests/deploy/ros2/": "robots in real time",
-    "tests/envs/robots/": "robots in real time",
-    "tests/envs/ros2/": "robots in real time",
-    "tests/envs/ur_controller/": "robots in real time",
     "tests/envs/robot_server/": "ports of server managers",
     "tests/export/graph/test_operators.py": "torch's compiler",  # imports it
     "tests/export/sources/test_leapp.py": "torch's compiler",
@@ -83,24 +78,33 @@ TOGETHER = {
     "tests/examples/test_training_scripts.py": "one Ray",
 }
 
+# Tests in which something moves in real time, by the beginning of their id: `make test` runs them after the others.
+REAL_TIME = (
+    "tests/deploy/cockpit/test_page.py",
+    "tests/deploy/ros2/",
+    "tests/robots/",
+    "tests/system/test_documents_run.py::test_guide_to_a_real_arm",
+    "tests/system/test_documents_run.py::test_guide_to_ros",
+)
+
 # The longest files begin first, those that mostly wait next to those that compute: none is left for the end. Of those
 # that need the same checkpoints one begins; the others come when they are trained.
 # The files with slow tests follow, then the rest.
 LONGEST = (
-    "robots in real time", "live server", "one Ray", "tests/system/test_documents_run.py",
+    "live server", "one Ray", "tests/system/test_documents_run.py",
     "ports of server managers", "tests/export/proof/test_exploration.py", "cluster", "shipped server",
     "tests/test_python_versions.py", "tests/serve_app/repository/test_remote_repository.py",
-    "tests/deploy/cockpit/test_page.py", "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py",
+    "tests/system/test_demo.py", "tests/examples/test_on_a_cluster.py",
     "tests/system/test_embedded_server.py", "tests/export/rllib/test_new_stack.py",
-    "tests/serve_app/client/test_bad_line.py", "sweep", "tests/serve_app/learning/test_online_learning.py",
+    "tests/client/test_bad_line.py", "sweep", "tests/deploy/learning/test_online_learning.py",
     "tests/export/rllib/test_filter_statistics.py", "several nodes", "tests/export/rllib/test_reported.py",
     "tests/system/test_remote_repository.py", "torch's compiler",
     # of `make quick`
-    "tests/serve_app/protocols/test_access.py", "tests/serve_app/recording/test_recorder.py",
-    "tests/serve_app/runtime/test_hostile_bundles.py", "tests/serve_app/server/test_current_keys.py",
+    "tests/serve_app/protocols/test_access.py", "tests/recording/test_recorder.py",
+    "tests/policy/test_hostile_bundles.py", "tests/serve_app/server/test_current_keys.py",
 )  # fmt: skip
 
-for name in {*TOGETHER, *LONGEST} - {*TOGETHER.values()}:
+for name in {*TOGETHER, *REAL_TIME, *LONGEST} - {*TOGETHER.values()}:
     assert Path(__file__).parents[1].joinpath(name.partition("::")[0]).exists(), (
         f"{name} is in a table, and is not there"
     )
@@ -131,6 +135,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByGroup:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.nodeid.startswith(REAL_TIME):
+            item.add_marker("realtime")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     places = {group: place for place, group in enumerate(LONGEST)}
     items.sort(key=lambda item: (places.get(group_of(item.nodeid), len(places)), item.path not in slow))

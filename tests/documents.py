@@ -98,7 +98,7 @@ def unknown_options(line: str) -> list[str]:
     if hasattr(command, "commands"):
         return words[1:2]
     known = {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
-    return [word for word in words if word.startswith("--") and word not in known]
+    return [word for word in words if word.startswith("--") and word.partition("=")[0] not in known]
 
 
 @dataclass

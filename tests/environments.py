@@ -26,7 +26,7 @@ PACKAGED = ("envs", "export", "serve_app", "deploy", "pyproject.toml", "README.m
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")
 # What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
 # pip would settle that with an old robo-gym-server-modules that has no pin and does not work.
-CLIENT = ("httpcore>=1.0.7", "orjson>=3.10", "pydantic>=2.10")
+CLIENT = ("httptools>=0.6.3", "orjson>=3.10", "pydantic>=2.10")
 INSTALLED_S = 500
 UNPACKED = "unpacked"  # beside the wheel
 

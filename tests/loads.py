@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.client.policy_client import PolicyClient
+from rlservo.client.policy_client import PolicyClient
+from rlservo.errors import RlservoError
 
 CLIENTS = 8
 PATIENCE_S = 120  # [s] on a busy machine
@@ -31,6 +32,7 @@ class Load:
     api_key: str | None = None
     pause_s: float = 0.02
     """After each of a client's requests [s]."""
+    version: str | None = None
     asked: int = 0
     failures: list[str] = field(default_factory=list)
     wrong: int = 0
@@ -50,7 +52,9 @@ class Load:
 
     def _ask(self, ended: threading.Event) -> None:
         url = f"http://127.0.0.1:{self.port}"
-        with PolicyClient(url, self.policy, timeout_s=5, retries=3, api_key=self.api_key) as policy:
+        with PolicyClient(
+            url, self.policy, timeout_s=5, retries=3, api_key=self.api_key, version=self.version
+        ) as policy:
             while not ended.is_set():
                 try:
                     action = policy.act(self.obs)
@@ -60,3 +64,8 @@ class Load:
                     self.wrong += not any(np.array_equal(action, right) for right in self.expected)
                 self.asked += 1
                 time.sleep(self.pause_s)
+
+
+def busiest(pids: Sequence[int]) -> int:
+    """Return the process that uses the processor most: clients' connections may all be to one worker."""
+    return max(pids, key=lambda pid: psutil.Process(pid).cpu_percent(interval=0.5))

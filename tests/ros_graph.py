@@ -107,6 +107,9 @@ def main() -> None:
             time.sleep(0.01)
         return {"sent_s": sent_s, **to_plain(future.result())}
 
+    def withdraw(topic: str) -> None:
+        node.destroy_publisher(made.pop(topic))
+
     def since(topic: str, time_s: float, count: int = KEPT) -> Any:
         return [(at, to_plain(one)) for at, one in messages[topic][-count:] if at >= time_s]
 
@@ -115,6 +118,7 @@ def main() -> None:
 
     known = {
         "subscribe": subscribe, "publish": publish, "call": call, "since": since, "publishers": publishers,
+        "withdraw": withdraw,
         "lead": lead, "arrived": lambda topic: arrived[topic],
     }  # fmt: skip
     print(json.dumps("ready"), flush=True)

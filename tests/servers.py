@@ -40,7 +40,7 @@ CONNECTIONS_PER_ADDRESS = 300
 # Runs the embedded server in a process's main thread, as the command line does, and prints when it is ready.
 LAUNCH = """
 import json, pathlib, sys
-from rlservo.export.contract.errors import RlservoError
+from rlservo.errors import RlservoError
 from rlservo.serve_app.engines.uvicorn_server import serve_policies
 plan = json.loads(sys.argv[1])
 key_file = plan.pop("admin_key_file")

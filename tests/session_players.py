@@ -18,9 +18,9 @@ from typing import Any, Protocol
 import grpc
 import numpy as np
 
-from rlservo.serve_app.protocols.open_inference.messages import messages
-from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.runtime.recurrent_state import State
+from rlservo.policy.policy import Policy
+from rlservo.policy.recurrent_state import State
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 
 MODEL = "lstm_box"
 # The last is a proxy's, whose replica has died.

@@ -7,16 +7,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.contract.contract import version_key
-from rlservo.serve_app.interface import PRODUCTION
-from rlservo.serve_app.runtime.options import PolicyOptions
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.bundle.contract import version_key
+from rlservo.policy.acting_policy import PRODUCTION
+from rlservo.policy.options import PolicyOptions
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
+from rlservo.serve_app.versions.deployment_plan import Plan, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.plan_follower import VersionState
-from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig
 
 
 def load_store(*folders: Path, options: Mapping[str, PolicyOptions] | None = None) -> PolicyStore:
@@ -42,6 +42,10 @@ def control_of(store: PolicyStore | Callable[[], PolicyStore | None] | None) -> 
 
 class _Given:
     behind = ()
+    recent = ()
+
+    def not_loaded(self) -> dict[str, list[str]]:
+        return {}
 
     def __init__(self, provide: Callable[[], PolicyStore | None]) -> None:
         self._provide = provide

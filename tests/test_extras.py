@@ -39,6 +39,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "estimate nowhere.mcap --bundle {bundle}": ("record",),
     "learn nowhere --policy ur5 --repository r --recordings r --out o": ("train", "client", "record"),
     "publish {bundle} s3://127.0.0.1/bucket": ("remote",),
+    "publish {bundle} hf://owner/name": ("hub",),
     "cockpit --robot-server 127.0.0.1:1": ("cockpit",),
     "rollout rlservo/EndEffectorPositioningURRob-v0 --bundle {bundle} --env-arg robot=rtde://127.0.0.1": ("ur", "sim"),
     "rollout rlservo/NoObstacleNavigationMir100Rob-v0 --bundle {bundle} --env-arg robot=rosbridge://127.0.0.1": (
@@ -48,6 +49,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "ros2 --bundle {bundle}": ("sim",),
     "ros2-sim ur5": ("sim",),
     "robot-latency rtde://127.0.0.1 --yes": ("ur", "sim"),
+    "robot-check rtde://127.0.0.1": ("ur", "sim"),
     "ur-controller --host 203.0.113.7": ("sim",),
     "server-manager --host 203.0.113.7": ("sim",),
     "robot-server ur --host 203.0.113.7": ("sim",),

@@ -53,9 +53,10 @@ def test_public_names_are_all_there_and_nothing_else() -> None:
 
 
 def test_examples_take_public_names_from_rlservo_itself() -> None:
+    pytest.importorskip("torch")
     named = {name: getattr(rlservo, name) for name in NAMES if not name.startswith("__")}
-    inside = {f"{getattr(each, '__module__', 'rlservo.export.contract')}.{name}" for name, each in named.items()}
-    assert {"rlservo.export.contract.errors", "rlservo.serve_app.runtime.policy.Policy"} < inside
+    inside = {f"{each.__module__}.{name}" for name, each in named.items() if name != "errors"}  # it is a module
+    assert "rlservo.policy.policy.Policy" in inside
     for file in sorted((ROOT / "examples").rglob("*.py")):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom):
@@ -89,6 +90,6 @@ def test_first_action_needs_no_event_loop_and_no_server(shipped: Path) -> None:
     """
     spent, *modules = python(program, shipped / "ur5").split()
     print(f"from numpy and onnxruntime to the first action: {spent} s of CPU time")
-    unwanted = {"asyncio", "fastapi", "gymnasium", "httpcore", "httpx", "multiprocessing", "ray", "rich", "ssl",
+    unwanted = {"asyncio", "fastapi", "gymnasium", "httptools", "httpx", "multiprocessing", "ray", "rich", "ssl",
                 "starlette", "torch", "typer", "websockets"}  # fmt: skip
     assert "pydantic" in modules and not unwanted & set(modules)

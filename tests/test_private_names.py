@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("envs", "export", "serve_app", "deploy")
+FOLDERS = ("rlservo", "envs", "export", "serve_app", "deploy")
 RLLIB = ROOT / "export" / "rllib"  # restores what RLlib keeps in private attributes
 DOCUMENTED = {"_replace", "_asdict", "_exit"}  # of named tuples and `os`: documented, in spite of their names
 RAY_VARIABLES = {
@@ -126,7 +126,8 @@ def test_our_servers_classes_have_no_private_name_in_common_with_their_bases() -
 
 
 def test_of_rays_variables_only_the_documented_ones_are_named() -> None:
-    files = [*modules("serve_app", "deploy"), *(ROOT / "deploy").rglob("*.yaml"), ROOT / "deploy" / "Dockerfile"]
+    deploy = ROOT / "deploy"
+    files = [*modules(*FOLDERS), *deploy.rglob("*.yaml"), deploy / "Dockerfile"]
     assert len(files) > 100
     named = {name for file in files for name in re.findall(r"\bRAY_[A-Z_]+[A-Z]\b", file.read_text())}
     assert named <= RAY_VARIABLES

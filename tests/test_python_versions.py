@@ -12,7 +12,7 @@ import pytest
 from environments import find_python, virtual_environment
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("envs", "export", "serve_app", "deploy", "examples")
+FOLDERS = ("rlservo", "envs", "export", "serve_app", "deploy", "examples")
 OLDEST = (3, 10)
 CLASSIFIER = re.compile(r'"Programming Language :: Python :: 3\.(\d+)"')
 
@@ -73,12 +73,11 @@ def environment_of(minor: str, *options: str | Path) -> Path:
 
 
 def linked_package(folder: Path) -> Path:
-    """Return a folder for PYTHONPATH where this tree is the package `rlservo`, as setuptools' package-dir makes it."""
-    package = folder / "path" / "rlservo"
-    package.mkdir(parents=True)
-    for source in [*(ROOT / "deploy" / "package").glob("*.py"), *(ROOT / name for name in FOLDERS[:4])]:
-        (package / source.name).symlink_to(source)
-    return package.parent
+    """Return a folder for PYTHONPATH where this tree is the package `rlservo`, and nothing else."""
+    path = folder / "path"
+    path.mkdir()
+    (path / "rlservo").symlink_to(ROOT / "rlservo")
+    return path
 
 
 @pytest.mark.slow

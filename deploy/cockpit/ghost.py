@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.deploy.cockpit.stage import Scene, Stage
-from rlservo.serve_app.interface import ActingPolicy, Closeable
+from rlservo.policy.acting_policy import ActingPolicy, Closeable
 
 
 class Ghost(Closeable):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import gzip
+import html
 import io
 import re
 import socket
@@ -21,7 +24,7 @@ import websockets.asyncio.server
 
 from rlservo.deploy.cockpit.inputs import checked_messages, point_of
 from rlservo.deploy.cockpit.stage import Vector
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 
 HOST = "127.0.0.1"
 FRAME_S = 1 / 30
@@ -57,7 +60,7 @@ class Shown(Protocol):
         ...
 
 
-class _Server(viser.ViserServer):
+class _PageServer(viser.ViserServer):
     """viser's server without its tunnel to the internet."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
@@ -69,8 +72,8 @@ class _Server(viser.ViserServer):
 def served_page(port: int, title: str) -> Iterator[viser.ViserServer]:
     """Serve an empty page until the block ends. Raises UsageError if the port is taken."""
     _check_port(port)
-    with _silence(), _guarded_requests():  # its own banner names a port that ours names as well
-        server = _Server(HOST, port, label=title, verbose=False)
+    with _silence(), _guarded_requests(title):  # its own banner names a port that ours names as well
+        server = _PageServer(HOST, port, label=title, verbose=False)
     try:
         with checked_messages():
             server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=False)
@@ -139,7 +142,7 @@ def _aim(camera: viser.CameraHandle, position: Vector, look_at: Vector) -> None:
         down = SHEET * np.tan(camera.fov / 2) * np.linalg.norm(way) * up / np.linalg.norm(up)
         position, look_at = look_at - way - down, look_at - down
     if point_of(camera.position) is not None and point_of(camera.look_at) is not None:  # viser fails with others
-        with contextlib.suppress(ValueError):  # the browser sent an impossible one just now
+        with contextlib.suppress(ValueError), np.errstate(all="ignore"):  # the browser sent an impossible one just now
             camera.position, camera.look_at = position, look_at
 
 
@@ -161,10 +164,10 @@ def _silence() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _guarded_requests() -> Iterator[None]:
+def _guarded_requests(title: str) -> Iterator[None]:
     """Let only the cockpit's own page, and programs, talk to it, and no other page embed it: viser has no such option.
 
-    Any other web page in the same browser could drive the robot.
+    Any other web page in the same browser could drive the robot. The tab of the page has this title.
     """
     server: Any = websockets.asyncio.server
     serve = server.serve
@@ -175,6 +178,10 @@ def _guarded_requests() -> Iterator[None]:
             reply = connection.respond(403, f"{refusal}\n") if refusal else process_request(connection, request)
             if reply is not None:
                 reply.headers.update(HEADERS)
+                if request.path.partition("?")[0] == "/" and not refusal:
+                    reply.body = _titled(reply.body, title)
+                    del reply.headers["Content-Length"]
+                    reply.headers["Content-Length"] = str(len(reply.body))
             return reply
 
         return serve(*given, process_request=answer, **options)
@@ -184,6 +191,14 @@ def _guarded_requests() -> Iterator[None]:
         yield
     finally:
         server.serve = serve
+
+
+@functools.lru_cache(maxsize=4)
+def _titled(page: bytes, title: str) -> bytes:
+    """Return viser's page, which may be compressed, with a title of its own."""
+    if page.startswith(b"\x1f\x8b"):
+        return gzip.compress(_titled(gzip.decompress(page), title))
+    return page.replace(b"<title>Viser</title>", f"<title>{html.escape(title)}</title>".encode(), 1)
 
 
 def _refusal(headers: Any) -> str:

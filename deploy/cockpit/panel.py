@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 import viser
 
+from rlservo.bundle.contract import Contract
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.inputs import number_of
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
-from rlservo.deploy.cockpit.policies import FALLBACKS, Choice, Link, PolicySource
+from rlservo.deploy.cockpit.policies import FALLBACKS, Choice, PolicySource, ServerLink
 from rlservo.deploy.cockpit.readings import Readings, escape
-from rlservo.deploy.cockpit.scenery import Scenery
-from rlservo.deploy.cockpit.stage import Disturbance, Stage
+from rlservo.deploy.cockpit.scenery import LEGEND, Scenery
+from rlservo.deploy.cockpit.stage import Stage, StageDisturbance
 from rlservo.deploy.cockpit.view import View
-from rlservo.envs.ur.parameters import UR_PARAMETERS
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import RlservoError
+from rlservo.errors import RlservoError
+from rlservo.robots.ur.parameters import UR_PARAMETERS
 
 NO_GHOST = "none"
 LOOK_S = 2.0  # between two looks at what a server has
@@ -80,6 +80,7 @@ class DrivePanel:
             self._payload = gui.add_slider("Payload [kg]", min=0.0, max=10.0, step=0.5, initial_value=0.0)
         with gui.add_folder("Ghost"):
             self._ghost = gui.add_dropdown("Second version", (NO_GHOST,))
+        gui.add_html(LEGEND)
         self._connect()
         self._offer_versions()
         self._looks = threading.Thread(target=self._look_again, name="cockpit-versions", daemon=True)
@@ -188,7 +189,7 @@ class DrivePanel:
 
     def _choose(self, env_arguments: dict[str, Any] | None = None) -> None:
         choice = Choice(self._name.value, self._version.value)
-        link = Link(number_of(self._deadline), self._fallback.value)
+        link = ServerLink(number_of(self._deadline), self._fallback.value)
         if env_arguments is not None:
             env_arguments = {**self._drive.view.stage.arguments, **env_arguments}
         self._drive.do(lambda: self._drive.choose(choice, link, env_arguments))
@@ -199,7 +200,7 @@ class DrivePanel:
         self._drive.do(lambda: self._drive.choose_ghost(choice))
 
     def _disturb(self) -> None:
-        disturbance = Disturbance(
+        disturbance = StageDisturbance(
             int(number_of(self._action_latency)), int(number_of(self._observation_latency)), number_of(self._noise)
         )
         if self._payload.visible:

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from rlservo.deploy.cockpit.inputs import number_of
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.readings import Readings, escape
-from rlservo.deploy.cockpit.scenery import Scenery
+from rlservo.deploy.cockpit.scenery import LEGEND, Scenery
 from rlservo.deploy.cockpit.stage import Scene, Stage, home_arguments, home_of
 from rlservo.deploy.cockpit.view import Cycle
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.recording.episodes import Episode, episodes
-from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.replay.follower import Follower
-from rlservo.serve_app.replay.replay import Moment, replay
+from rlservo.errors import UsageError
+from rlservo.recording.episodes import RecordedEpisode, episodes
+from rlservo.recording.reader import Recording
+from rlservo.recording.replay.follower import Follower
+from rlservo.recording.replay.replay import Moment, replay
 
 MOST_EPISODES = 500  # in memory
 # Objects whose position is not recorded are left out: the room and the cubes round a MiR100.
@@ -41,7 +41,7 @@ class Tape:
         """Differences of the bundle's actions from the recorded ones, by episode; NaN if unknown."""
         self.moments: list[Moment] = []
         """The moments at which they differ most."""
-        self.episodes: list[Episode] = []
+        self.episodes: list[RecordedEpisode] = []
         if bundle is None:
             self.episodes = list(islice(_of_one_policy(recording, policy), MOST_EPISODES))
         else:
@@ -116,6 +116,7 @@ class PlaybackPanel:
         self._last = time.perf_counter()
         gui = server.gui
         self.status = gui.add_markdown("")
+        gui.add_html(LEGEND)
         with gui.add_folder("Recording"):
             titles = tuple(f"{number}: {_title(episode)}" for number, episode in enumerate(tape.episodes))
             self._choice = gui.add_dropdown("Episode", titles)
@@ -198,9 +199,9 @@ class PlaybackPanel:
             self._row = float(min(last, max(0, int(self._row) + way)))
 
 
-def _of_one_policy(recording: Recording, name: str | None) -> Sequence[Episode]:
+def _of_one_policy(recording: Recording, name: str | None) -> Sequence[RecordedEpisode]:
     """Return the episodes of the policy that was named, or of the one that comes first."""
-    found: list[Episode] = []
+    found: list[RecordedEpisode] = []
     for episode in episodes(recording):
         wanted = name or (found[0].policy.contract.name if found else episode.policy.contract.name)
         if episode.policy.contract.name == wanted:
@@ -210,7 +211,7 @@ def _of_one_policy(recording: Recording, name: str | None) -> Sequence[Episode]:
     return found
 
 
-def _title(episode: Episode) -> str:
+def _title(episode: RecordedEpisode) -> str:
     return f"{episode.final_status or ('ended' if episode.ended else 'no end')}, {len(episode)} decisions"
 
 

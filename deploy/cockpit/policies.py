@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from rlservo.export.contract.bundle import find_bundles, read_contract
-from rlservo.export.contract.errors import UnavailableError, UnknownPolicyError
-from rlservo.serve_app.client.http_transport import Transport
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.interface import ActingPolicy, Closeable
-from rlservo.serve_app.rollout.fallback import WithFallback
-from rlservo.serve_app.runtime.compiled_policy import open_policy
+from rlservo.bundle.bundle import find_bundles, read_contract
+from rlservo.bundle.production import PRODUCTION, production_of
+from rlservo.client.http_transport import Transport
+from rlservo.client.policy_client import PolicyClient
+from rlservo.drive.fallback import WithFallback
+from rlservo.errors import BundleError, UnavailableError, UnknownPolicyError
+from rlservo.policy.acting_policy import ActingPolicy, Closeable
+from rlservo.policy.compiled_policy import open_policy
 
 TIMEOUT_S = 2.0  # of a look at what the server has
 WAIT = "wait"  # instead of a fallback: time stands still until the server answers
@@ -20,7 +21,7 @@ FALLBACKS = (WAIT, "hold", "zero", "stop")
 
 
 @dataclass(frozen=True)
-class Link:
+class ServerLink:
     """Transport and limits of requests to a server."""
 
     deadline_ms: float = 1000.0
@@ -44,7 +45,7 @@ class PolicySource(Closeable, Protocol):
         """Return each policy's aliases, then its versions from the newest on. May raise UnavailableError."""
         ...
 
-    def open(self, choice: Choice, link: Link) -> ActingPolicy:
+    def open(self, choice: Choice, link: ServerLink) -> ActingPolicy:
         """Return the policy to act with. Raises UnknownPolicyError, BundleError or UnavailableError."""
         ...
 
@@ -71,7 +72,7 @@ class ServedPolicies(PolicySource):
                 f"{self.url} sent a list of policies that cannot be read: is it another version of rlservo?"
             ) from error
 
-    def open(self, choice: Choice, link: Link) -> ActingPolicy:
+    def open(self, choice: Choice, link: ServerLink) -> ActingPolicy:
         client = PolicyClient(
             self.url,
             choice.name,
@@ -101,17 +102,34 @@ class BundledPolicies(PolicySource):
     def __init__(self, folder: Path) -> None:
         """Raise BundleError if there is none."""
         self._folders: dict[Choice, Path] = {}
-        for bundle in find_bundles(folder):
-            contract = read_contract(bundle)
-            self._folders[Choice(contract.name, contract.version)] = bundle
+        self._production: dict[str, str | BundleError] = {}
+        """The production version by policy, or why it is not known."""
+        bundles = find_bundles(folder)
+        for bundle in bundles:
+            name, version = (contract := read_contract(bundle)).name, contract.version
+            self._folders[Choice(name, version)] = bundle
+            if name not in self._production and sum(each.parent == bundle.parent for each in bundles) > 1:
+                try:
+                    if (production := production_of(bundle.parent, name)) is not None:
+                        self._production[name] = production.version
+                except BundleError as error:
+                    self._production[name] = error
 
     def versions(self) -> dict[str, list[str]]:
         found: dict[str, list[str]] = {}
         for choice in reversed(self._folders):
             found.setdefault(choice.name, []).append(choice.version)
+        for name, versions in found.items():
+            if name in self._production:
+                versions.insert(0, PRODUCTION)
         return dict(sorted(found.items()))
 
-    def open(self, choice: Choice, link: Link) -> ActingPolicy:  # noqa: ARG002
+    def open(self, choice: Choice, link: ServerLink) -> ActingPolicy:  # noqa: ARG002
+        if choice.version == PRODUCTION:
+            production = self._production.get(choice.name, PRODUCTION)
+            if isinstance(production, BundleError):
+                raise production
+            choice = Choice(choice.name, production)
         if choice not in self._folders:
             there = ", ".join(f"{each.name}/{each.version}" for each in self._folders)
             raise UnknownPolicyError(f"there is no bundle {choice.name}/{choice.version}: expected one of {there}")

@@ -10,10 +10,10 @@ import viser
 import viser.uplot
 from numpy.typing import NDArray
 
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.spaces import BoxSpec, LeafSpec
 from rlservo.deploy.cockpit.view import Cycle
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.spaces import BoxSpec, LeafSpec
-from rlservo.serve_app.runtime.drift import SMALLEST_STD, training_moments
+from rlservo.policy.drift import SMALLEST_STD, training_moments
 
 FAR, VERY_FAR = 3.0, 5.0  # standard deviations from the training's mean
 AMBER, RED = "#ffe08a", "#ff9d8f"
@@ -102,9 +102,9 @@ class Elements:
 
 
 class Plot:
-    """A moving plot of some series."""
+    """A moving plot of some series over the control cycles."""
 
-    def __init__(self, gui: viser.GuiApi, title: str, labels: Sequence[str], height: int = 150) -> None:
+    def __init__(self, gui: viser.GuiApi, title: str, labels: Sequence[str], unit: str = "", height: int = 165) -> None:
         shown = _without_common_end(labels[:MOST_SERIES])
         self._count = len(shown)
         empty = np.zeros(1)
@@ -118,6 +118,7 @@ class Plot:
                 ),
             ),
             title=title,
+            axes=(_axis("control cycle"), _axis(unit)),
             scales={"x": viser.uplot.Scale(time=False)},
             legend=viser.uplot.Legend(show=self._count > 1),
             height=height,
@@ -142,6 +143,10 @@ class Plot:
             self._plot.visible = visible
 
 
+def _axis(label: str) -> viser.uplot.Axis:
+    return viser.uplot.Axis(label=label, labelSize=16 if label else 0, labelFont="11px sans-serif")
+
+
 class Readings:
     """Plots of one policy's actions, and a table of its observation, in a panel next to the scene."""
 
@@ -153,11 +158,13 @@ class Readings:
         has_value = any(tensor.name == "value" for tensor in contract.outputs)
         self._panel = gui.add_panel()
         with self._panel.add_tab("Plots"):
-            self._distance = Plot(gui, "Distance from the target [m]", ["distance"])
-            self._action = Plot(gui, "Action", acted.names)
-            self._difference = Plot(gui, difference, acted.names)
-            self._value = Plot(gui, "Value (the critic's)", ["value"]) if has_value else None
-            self._latency = Plot(gui, "Latency [ms]", ["latency", "late beyond"])
+            units = set(acted.units) - {"", "1"}
+            unit = units.pop() if len(units) == 1 else ""
+            self._distance = Plot(gui, "Distance from the target", ["distance"], "m")
+            self._action = Plot(gui, "Action", acted.names, unit)
+            self._difference = Plot(gui, difference, acted.names, unit)
+            self._value = Plot(gui, "Value (the critic's)", ["value"], "return") if has_value else None
+            self._latency = Plot(gui, "Latency", ["latency", "late beyond"], "ms")
         with self._panel.add_tab("Observation"):
             self._table = gui.add_html("")
         self._panel.dock_left()

@@ -17,9 +17,9 @@ from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import Choice, PolicySource
 from rlservo.deploy.cockpit.watch import WatchPanel
 from rlservo.deploy.terminal import ctrl_c_sets
-from rlservo.export.contract.errors import UnknownPolicyError, UsageError
-from rlservo.serve_app.interface import PRODUCTION
-from rlservo.serve_app.recording.recorder import Recorder
+from rlservo.errors import UnknownPolicyError, UsageError
+from rlservo.policy.acting_policy import PRODUCTION
+from rlservo.recording.recorder import Recorder
 
 OnReady = Callable[[str], None]
 
@@ -40,7 +40,7 @@ def run_drive(
     """Let a policy drive a robot on a page until Ctrl-C. Everything that was opened is closed."""
     with ExitStack() as cleanup:
         cleanup.callback(source.close)
-        choice = _first_choice(source, policy, version)
+        choice = first_choice(source, policy, version)
         recorder = None if record is None else cleanup.enter_context(Recorder(record))
         drive = Drive(
             source, choice, env_id=env_id, env_arguments=env_arguments, seed=seed, recorder=recorder, unproven=unproven
@@ -93,7 +93,7 @@ def _serve(server: viser.ViserServer, panel: Shown, on_ready: OnReady) -> None:
         show(panel, stop)
 
 
-def _first_choice(source: PolicySource, policy: str | None, version: str | None) -> Choice:
+def first_choice(source: PolicySource, policy: str | None, version: str | None) -> Choice:
     """Return the initial choice: the default version of the policy, or of the first one."""
     versions = source.versions()
     if not versions:

@@ -26,6 +26,14 @@ TARGET_LIFT, ROBOT_LIFT, OBSTACLE_LIFT = 0.1, 0.45, 0.55  # [m], of handles on t
 HELD_S = 1.0  # after the last movement
 HANDLE_SIZE, PLANAR_HANDLE_SIZE = 0.3, 1.0  # [m]
 
+LEGEND = "<div style='font-size:0.75em;padding:0 1em 0.5em'>{}; axes: x red, y green, z blue</div>".format(
+    ", ".join(
+        f"<span style='color:rgb{colour}'>&#9632;</span>&nbsp;{name}"
+        for colour, name in ((PATH_COLOUR, "robot's path"), (GHOST_COLOUR, "ghost"), (BEAM_COLOUR, "laser beams"))
+    )
+)
+AXES_LENGTH, AXES_RADIUS = 0.25, 0.006  # [m], at an arm's base, else the world's origin
+
 Move = Callable[[Vector], None]
 MoveOne = Callable[[int, Vector], None]
 
@@ -64,6 +72,9 @@ class Scenery:
         )
         self._points = np.zeros((0, 3))
         self._drawn_beams: Vector | None = None
+        self._axes = server.scene.add_frame(
+            "/axes", axes_length=AXES_LENGTH, axes_radius=AXES_RADIUS, position=getattr(env, "BASE", np.zeros(3))
+        )
         self._target, self._start = None, None
         if on_target is not None and env.target_position() is not None:
             self._target = _Handle(server, "/target", TARGET_LIFT, env.IS_PLANAR, on_target)
@@ -106,7 +117,7 @@ class Scenery:
     def remove(self) -> None:
         """Remove everything."""
         parts = (self._robot, self._ghost, self._target, self._start, *self._obstacles)
-        for part in (*parts, self._beams, self._path, self._floor):
+        for part in (*parts, self._beams, self._path, self._axes, self._floor):
             if part is not None:
                 part.remove()
 

@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.envs.checks import InvalidResetError
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.environment_id import NAMESPACE
+from rlservo.drive.make_environment import check_fit, check_proven, control_rate_of, make_env
 from rlservo.envs.randomization import DomainRandomization, wrapped_env
 from rlservo.envs.rendering import RenderedEnv, Start
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.environment_id import NAMESPACE
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.rollout.environment import check_fit, check_proven, control_rate_of, make_env
+from rlservo.errors import UsageError
+from rlservo.robots.checks import InvalidResetError
 
 Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Disturbance:
+class StageDisturbance:
     """Disturbances of `DomainRandomization`, the same in every episode."""
 
     action_latency: int = 0  # control cycles
@@ -77,7 +77,7 @@ class Stage:
         if not self._unproven:
             check_proven(contract, self._made)
 
-    def disturb(self, disturbance: Disturbance) -> None:
+    def disturb(self, disturbance: StageDisturbance) -> None:
         """Change the disturbances, from the next episode on. Raises ValueError for an unsupported one."""
         self._disturbed = DomainRandomization(
             self._made,

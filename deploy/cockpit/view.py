@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from numpy.typing import NDArray
 
+from rlservo.bundle.contract import Contract
 from rlservo.deploy.cockpit.stage import Scene, Stage
-from rlservo.export.contract.contract import Contract
 
 Phase = Literal["driving", "paused", "arrived"]
 

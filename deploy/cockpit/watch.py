@@ -17,7 +17,7 @@ from rlservo.deploy.cockpit.scenery import Scenery
 from rlservo.deploy.cockpit.stage import Scene, Stage
 from rlservo.envs.robot_server.robots.robot import RobotState
 from rlservo.envs.robot_server.state_reader import RobotServerError, StateReader, env_of, quantities, show_state
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.errors import UnavailableError
 
 PERIOD_S = 0.05  # between two looks at the state
 RETRY_S = 1.0

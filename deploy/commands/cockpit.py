@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.deploy.commands.environment_options import parse_env_arguments
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.deploy.commands.bundle_folder import bundle_of
+from rlservo.deploy.commands.environment_options import Target, parse_env_arguments
+from rlservo.errors import UsageError
+from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
     from rlservo.deploy.cockpit.policies import PolicySource
@@ -32,6 +33,7 @@ def cockpit(
     env_arg: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
     ] = None,
+    target: Target = None,
     recording: Annotated[
         Path | None, typer.Option(help="Show a recording (.mcap); with --bundle, also that bundle's actions.")
     ] = None,
@@ -65,7 +67,7 @@ def cockpit(
         )
     if record is not None and (recording is not None or robot_server is not None):
         raise UsageError("--record needs --url or --bundle")
-    arguments = parse_env_arguments(env_arg or [])
+    arguments = parse_env_arguments(env_arg or [], target)
     if "robot" in arguments:  # prints a line per change of its state
         terminal.show_log()
     with needs_extra("cockpit"):
@@ -73,7 +75,8 @@ def cockpit(
 
     with terminal.ends_like_ctrl_c(), contextlib.suppress(KeyboardInterrupt):
         if recording is not None:
-            run_playback(recording, bundle=bundle, policy=policy, env_id=env, port=port, on_ready=_tell)
+            chosen = None if bundle is None else bundle_of(bundle, version)
+            run_playback(recording, bundle=chosen, policy=policy, env_id=env, port=port, on_ready=_tell)
             return
         if robot_server is not None:
             run_watch(robot_server, env_arguments=arguments, port=port, on_ready=_tell)

@@ -8,12 +8,13 @@ from typing import Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
+from rlservo.deploy.commands.bundle_folder import FOLDER, Version, bundle_of
 from rlservo.deploy.terminal import Json, print_json
-from rlservo.export.contract.extras import needs_extra
+from rlservo.extras import needs_extra
 
 
 def compile(
-    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder for its newest version.")],
+    bundle: Annotated[Path, typer.Argument(help=FOLDER)],
     out: Annotated[Path, typer.Option(help="Folder for the C files; an earlier one of the same policy is replaced.")],
     cc: Annotated[
         str | None, typer.Option(help="C compiler for the proof; $CC or the machine's own by default.")
@@ -21,6 +22,7 @@ def compile(
     embed_weights: Annotated[
         Literal["c", "bin"], typer.Option(help="Weights in the C file, or in a binary file beside it (large networks).")
     ] = "c",
+    version: Version = None,
     as_json: Json = False,
 ) -> None:
     """Convert a bundle to one proven C99 file.
@@ -33,8 +35,9 @@ def compile(
     with needs_extra("train", "onnx"):
         from rlservo.export.compiled.compile import compile_bundle
 
+    chosen = bundle_of(bundle, version)
     with terminal.status("importing") as show, terminal.ends_like_ctrl_c():
-        made = compile_bundle(bundle, out, compiler=cc, weights_in_file=embed_weights == "bin", progress=show)
+        made = compile_bundle(chosen, out, compiler=cc, weights_in_file=embed_weights == "bin", progress=show)
     if as_json:
         print_json({"path": str(made.folder), **made.about})
         return

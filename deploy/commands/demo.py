@@ -9,7 +9,7 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.environment_options import choose_gl_backend
-from rlservo.export.contract.extras import needs_extra
+from rlservo.extras import needs_extra
 
 
 def demo(
@@ -31,7 +31,7 @@ def demo(
     Example: `rlservo demo` in the checkout (`make demo` installs everything first)
     """
     choose_gl_backend()
-    with needs_extra("all", "ray", "torch", "mujoco", "httpcore", *(("viser",) if cockpit else ())):
+    with needs_extra("all", "ray", "torch", "mujoco", "httptools", *(("viser",) if cockpit else ())):
         from rlservo.deploy.demo.demo import run_demo
 
     def open_cockpit(url: str) -> None:

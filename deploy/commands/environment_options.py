@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Any
+from typing import Annotated, Any
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import require
+import typer
+
+from rlservo.errors import UsageError
+from rlservo.extras import require
 
 
-def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:
-    """Parse NAME=VALUE pairs; a value that is not JSON is a string."""
-    arguments: dict[str, Any] = {}
+def parse_env_arguments(pairs: list[str], target: str | None = None) -> dict[str, Any]:
+    """Parse NAME=VALUE pairs; a value that is not JSON is a string. Own environments take a target by that name."""
+    arguments: dict[str, Any] = {} if target is None else {"target": target}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals or not name.isidentifier():
@@ -22,6 +24,16 @@ def parse_env_arguments(pairs: list[str]) -> dict[str, Any]:
         except json.JSONDecodeError:
             arguments[name] = value
     return arguments
+
+
+Target = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FRAME:NUMBERS",
+        help="Target of rlservo's own robots. Arm: base_link:X,Y,Z or base:X,Y,Z (the pendant's frame; m, and "
+        "ROLL,PITCH,YAW in rad), or joints:... (6, rad), the flange's pose there. Base: odom:X,Y or base_link:X,Y (m).",
+    ),
+]
 
 
 def require_robot(robot: str) -> None:

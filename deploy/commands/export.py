@@ -11,9 +11,10 @@ from typing import Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
+from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.deploy.terminal import Json, note, print_json
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.errors import UsageError
+from rlservo.extras import needs_extra
 
 
 def export(
@@ -46,14 +47,54 @@ def export(
         ),
     ] = False,
     source: Annotated[
-        str | None, typer.Option(help="Checkpoint's trainer (rllib, sb3, rsl_rl, skrl, leapp); detected by default.")
+        str | None,
+        typer.Option(help="Checkpoint's trainer (rllib, sb3, rsl_rl, skrl, leapp, onnx); detected by default."),
     ] = None,
     vecnormalize: Annotated[
-        Path | None, typer.Option(help="Stable-Baselines3: path of vecnormalize.pkl, if it is not beside the model.")
+        Path | None,
+        typer.Option(
+            help="Stable-Baselines3: path of vecnormalize.pkl, if it is not beside the model; `none`: "
+            "observations were not normalized."
+        ),
     ] = None,
     frame_stack: Annotated[
         int, typer.Option(min=1, help="Stable-Baselines3: number of frames that VecFrameStack stacked.")
     ] = 1,
+    joint_order: Annotated[
+        str,
+        typer.Option(
+            metavar="JOINT,JOINT,...",
+            help="Isaac Lab, mjlab: the robot's joints in its own order, if no file of the run has them.",
+        ),
+    ] = "",
+    control_rate: Annotated[
+        float | None, typer.Option(min=1e-3, metavar="HZ", help="Control rate [Hz], if no file has it.")
+    ] = None,
+    action_range: Annotated[
+        str, typer.Option(metavar="LOW,HIGH", help="ONNX: bounds to clip every element of the action to.")
+    ] = "",
+    output: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="OUTPUT=USE",
+            help="ONNX: use of an output that its name does not tell: `action`, `none`, or the input that gets it at "
+            "the next step (a recurrent state).",
+        ),
+    ] = None,
+    env: Annotated[
+        str | None, typer.Option(help="Environment whose describe() says what the elements are, if no file does.")
+    ] = None,
+    env_arg: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="With --env: its constructor argument (JSON value).")
+    ] = None,
+    convention: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="What no file says: quaternion=wxyz or xyzw, frame=NAME (of poses and velocities), action=absolute, "
+            "relative, velocity or effort.",
+        ),
+    ] = None,
     reward: Annotated[
         str, typer.Option(metavar="MODULE:FUNCTION", help="Reward function for `rlservo learn`, named in the contract.")
     ] = "",
@@ -67,17 +108,28 @@ def export(
 ) -> None:
     """Convert a checkpoint to a policy bundle. It is proven equal to the trainer's own actions, or nothing is written.
 
+    An ONNX file is taken as given, and compared only with itself in onnxruntime.
+
     Examples: `rlservo export examples/checkpoints/ur_positioning --out policies`,
     `rlservo export model.zip --out policies`,
     `rlservo export ~/ray_results/PPO_2026 --metric env_runners/episode_return_mean --out policies`
     """
     start = time.perf_counter()
-    from rlservo.export.contract.contract import REWARD_PATTERN  # not needed for `--help`
+    from rlservo.bundle.contract import REWARD_PATTERN  # not needed for `--help`
 
     if re.fullmatch(REWARD_PATTERN, reward) is None:
         raise UsageError(f"--reward {reward[:80]!r}: expected MODULE:FUNCTION, such as my_rewards:reach")
-    if all_modules and (module_id is not None or agent_id is not None):
-        raise UsageError("--all-modules exports every module: leave --module-id and --agent-id out")
+    of_one = {
+        "--module-id": module_id, "--agent-id": agent_id, "--env": env, "--convention": convention, "--reward": reward,
+        "--vecnormalize": vecnormalize, "--frame-stack": frame_stack > 1, "--joint-order": joint_order,
+        "--control-rate": control_rate, "--action-range": action_range, "--output": output,
+    }  # fmt: skip
+    if all_modules and (given := [option for option, value in of_one.items() if value]):
+        raise UsageError(f"--all-modules exports every module: leave {' and '.join(given)} out")
+    if env_arg and env is None:
+        raise UsageError("--env-arg needs --env")
+    conventions = dict(_pair("--convention", text, "quaternion=xyzw") for text in convention or ())
+    outputs = dict(_pair("--output", text, "h_out=h_in") for text in output or ())
     with terminal.status("importing") as show, ExitStack() as fetching:
         with needs_extra("train", "gymnasium"):
             from rlservo.export.rllib import quick_import
@@ -124,6 +176,13 @@ def export(
                 source=source,
                 vecnormalize=vecnormalize,
                 frame_stack=frame_stack,
+                joint_order=[joint.strip() for joint in joint_order.split(",") if joint.strip()],
+                control_rate_hz=control_rate,
+                action_range=_range(action_range),
+                outputs=outputs,
+                env=env,
+                env_kwargs=parse_env_arguments(env_arg or []),
+                conventions=conventions,
                 reward=reward,
                 notify=note,
                 progress=show,
@@ -143,6 +202,25 @@ def export(
     terminal.output().print(
         f"cost      {cost['seconds']:.1f} s, {cost['peak_memory_mb']} MB at the peak", highlight=False
     )
+
+
+def _pair(option: str, text: str, example: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise UsageError(f"{option} {text!r}: expected NAME=VALUE, such as {example}")
+    return name, value
+
+
+def _range(text: str) -> tuple[float, float] | None:
+    if not text:
+        return None
+    try:
+        low, high = (float(side) for side in text.split(","))
+    except ValueError:
+        low, high = 0.0, 0.0
+    if not low < high:
+        raise UsageError(f"--action-range {text!r}: expected LOW,HIGH, such as -1,1")
+    return low, high
 
 
 def prune(

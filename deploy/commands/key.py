@@ -13,7 +13,7 @@ def key(
     label: Annotated[str, typer.Argument(help="Label of the key, such as a robot's or user's name; shown in logs.")],
     admin: Annotated[bool, typer.Option("--admin", help="Make an admin key; robots do not need one.")] = False,
     explore: Annotated[
-        bool, typer.Option("--explore", help="Let the key also request exploring actions ('rlservo learn').")
+        bool, typer.Option("--explore", help="Let the key also request exploratory actions ('rlservo learn').")
     ] = False,
     rate: Annotated[
         float | None,

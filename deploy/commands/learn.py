@@ -1,4 +1,4 @@
-"""The command `rlservo learn`; the work is in serve_app/learning."""
+"""The command `rlservo learn`; the work is in deploy/learning."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.policy import LOCAL, KeyFile
 from rlservo.deploy.commands.promote import LONGEST_S, PERCENT, SECONDS, parse_number
-from rlservo.export.contract.errors import UnavailableError, UsageError
-from rlservo.export.contract.extras import needs_extra, require
+from rlservo.errors import UnavailableError, UsageError
+from rlservo.extras import needs_extra, require
 
 
 def learn(
-    checkpoint: Annotated[Path, typer.Argument(help="A whole checkpoint of RLlib's PPO, APPO or SAC, not pruned.")],
+    checkpoint: Annotated[
+        Path, typer.Argument(help="Complete checkpoint of RLlib's PPO, APPO or SAC, not a pruned one.")
+    ],
     policy: Annotated[str, typer.Option(help="Served policy to train.")],
     repository: Annotated[
         str, typer.Option(metavar="DIR|URI", help="The server's repository, where versions are published.")
@@ -48,6 +50,10 @@ def learn(
             help="Python file with reward(obs, action, next_obs), in place of the contract's or the clients' rewards.",
         ),
     ] = None,
+    reward_from: Annotated[
+        list[str],
+        typer.Option(metavar="MODULE", help="Module whose functions the contract may name as reward; repeat it."),
+    ] = [],  # noqa: B006
     versions: Annotated[
         int | None, typer.Option(min=1, help="Stop after this many new versions; by default at Ctrl-C.")
     ] = None,
@@ -78,12 +84,12 @@ def learn(
     """
     require("train", "torch", "onnx")
     with needs_extra("client"):
-        from rlservo.serve_app.client.admin_client import AdminClient, find_key
-        from rlservo.serve_app.client.promotion import Terms
-        from rlservo.serve_app.client.promotion_evidence import Limits
+        from rlservo.client.admin_client import AdminClient, find_key
+        from rlservo.client.promotion import Terms
+        from rlservo.client.promotion_evidence import PromotionLimits
     with needs_extra("record"):
-        from rlservo.serve_app.learning.following import FollowedRecordings, ServerRecordings
-    from rlservo.serve_app.learning.run_folder import RunFolder
+        from rlservo.deploy.learning.followed_recordings import FollowedRecordings, ServerRecordings
+    from rlservo.deploy.learning.run_folder import RunFolder
 
     for url in {server, *follow}:
         find_key(url, key_file)  # a missing key is detected before anything is loaded
@@ -103,11 +109,11 @@ def learn(
         RunFolder(out, terms, source) as run,
         terminal.status("restoring the checkpoint (importing torch and RLlib takes seconds)") as show,
     ):
+        from rlservo.deploy.learning.episode_filter import EpisodeFilter, reward_of
+        from rlservo.deploy.learning.online import OnlineLearning, why_interrupted
+        from rlservo.deploy.learning.release import Release, Target
+        from rlservo.deploy.learning.rllib_learner import OnlineLearner
         from rlservo.export.checkpoints.unpickle import user_code
-        from rlservo.serve_app.learning.admission import Admission, reward_of
-        from rlservo.serve_app.learning.online import OnlineLearning, why_interrupted
-        from rlservo.serve_app.learning.release import Release, Target
-        from rlservo.serve_app.learning.rllib_learner import OnlineLearner
 
         if promote is None:
             watched = None
@@ -118,7 +124,7 @@ def learn(
             seconds = parse_number("--promote", promote, SECONDS, LONGEST_S)
             if not share or not seconds:
                 raise UsageError("--promote and --canary: expected more than 0")
-            watched = Terms((server,), policy, "", share, seconds, Limits(error_rate=rate, success_drop=drop))
+            watched = Terms((server,), policy, "", share, seconds, PromotionLimits(error_rate=rate, success_drop=drop))
         copies = [
             ServerRecordings(partial(connect, url), run.path / "followed" / re.sub(r"[^A-Za-z0-9.]+", "_", url))
             for url in follow
@@ -130,9 +136,9 @@ def learn(
                 learner = OnlineLearner(checkpoint, batch_size=batch_size)
                 target = Target(policy, repository, alias, watched)
                 release = Release(target, run, partial(connect, server), app_dir=app_dir, progress=show)
-                function = release.named_reward() if source is None else reward_of(source, str(reward))
+                function = release.named_reward(reward_from) if source is None else reward_of(source, str(reward))
                 age = learner.max_age if max_age is None else max_age
-                admission = Admission(policy, max_age=age, reward=function)
+                admission = EpisodeFilter(policy, max_age=age, reward=function)
                 learning = OnlineLearning(
                     learner, run, followed, admission, release, every=every, say=_say, progress=show
                 )

@@ -11,15 +11,14 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.terminal import Json, print_json
-from rlservo.export.contract.extras import needs_extra
+from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.recording.summary import Summary
+    from rlservo.recording.summary import Summary
 
 log = typer.Typer(no_args_is_help=True, help="Show, convert and draw recordings.")
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), or folders with recordings.")]
-Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder for its newest version.")]
 PolicyName = Annotated[
     str | None, typer.Option("--policy", help="Name of the recorded policy; required if the recordings hold several.")
 ]
@@ -40,8 +39,8 @@ def info(files: Files, as_json: Json = False) -> None:
     Example: `rlservo log info recordings`
     """
     with needs_extra("record"):
-        from rlservo.serve_app.recording.reader import Recording
-        from rlservo.serve_app.recording.summary import summarise_recording
+        from rlservo.recording.reader import Recording
+        from rlservo.recording.summary import summarise_recording
 
     summary = summarise_recording(Recording(files, with_bags=True))
     if as_json:
@@ -63,10 +62,10 @@ def export(
     Example: `rlservo log export run.mcap --to parquet --out run.parquet`
     """
     with needs_extra("record"):
-        from rlservo.serve_app.recording.conversion.lerobot import export_lerobot
-        from rlservo.serve_app.recording.conversion.minari import PATH_VARIABLE, export_minari
-        from rlservo.serve_app.recording.conversion.parquet import export_parquet
-        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.recording.conversion.lerobot import export_lerobot
+        from rlservo.recording.conversion.minari import PATH_VARIABLE, export_minari
+        from rlservo.recording.conversion.parquet import export_parquet
+        from rlservo.recording.reader import Recording
 
     recording = Recording(files)
     if to is Format.parquet:
@@ -94,7 +93,7 @@ def repair(
     Example: `rlservo log repair run.mcap --out whole.mcap`
     """
     with needs_extra("record"):
-        from rlservo.serve_app.recording.repair import repair_recording
+        from rlservo.recording.repair import repair_recording
 
     facts = repair_recording(file, out)
     _line(f"written {out}: {facts.messages} messages{f'; {file} is {facts.damage}' if facts.damage else ''}")
@@ -104,8 +103,10 @@ def repair(
 def plot(
     files: Files,
     episode: Annotated[
-        int, typer.Option(min=0, help="Number of the episode, from 0, in the order in which they ended.")
+        int,
+        typer.Option(min=0, help="Number of the episode, from 0, in the order in which the policy's episodes ended."),
     ] = 0,
+    policy: PolicyName = None,
     out: Annotated[Path, typer.Option(help="File for the picture: .png, .svg or .pdf.")] = Path("episode.png"),
 ) -> None:
     """Draw one recorded episode.
@@ -115,10 +116,10 @@ def plot(
     Example: `rlservo log plot run.mcap --episode 3 --out episode.png`
     """
     with needs_extra("record"):
-        from rlservo.serve_app.recording.plot import plot_episode
-        from rlservo.serve_app.recording.reader import Recording
+        from rlservo.recording.plot import plot_episode
+        from rlservo.recording.reader import Recording
 
-    drawn = plot_episode(Recording(files), episode, out)
+    drawn = plot_episode(Recording(files), episode, out, name=policy)
     terminal.output().print(f"written {out}: {len(drawn)} decisions", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -126,6 +127,8 @@ def _print_summary(summary: Summary) -> None:
     for file in summary.files:
         state = "whole" if file["whole"] else "being written" if file["being_written"] else "without an end"
         notes = [f"{file['messages']} messages", state]
+        if file["deleted"]:
+            notes = ["deleted before it was read"]
         if file["bag_topics"]:
             notes = [f"a ROS 2 bag, {_bag(file, summary)}", *notes[1:]]
         if file["dropped"]:
@@ -138,7 +141,9 @@ def _print_summary(summary: Summary) -> None:
     for policy in summary.policies:
         _line(f"{policy.name} version {policy.version}  graph {policy.graph_sha256[:12] or 'not known'}")
         span = policy.last_s - policy.first_s
-        _line(f"  {policy.episodes} episodes ({policy.ended} ended), {policy.decisions} decisions over {span:.1f} s")
+        last = f", {policy.seconds:.1f} s long together" if policy.episodes else ""
+        decisions = f"{policy.decisions} decisions recorded over {span:.1f} s"
+        _line(f"  {policy.episodes} episodes ({policy.ended} ended){last}, {decisions}")
         if policy.endings:
             _line(f"  endings: {', '.join(f'{word}: {count}' for word, count in policy.endings.items())}")
         if policy.return_mean is not None:

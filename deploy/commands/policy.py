@@ -12,12 +12,12 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.serve import split_pair, split_share
 from rlservo.deploy.terminal import Json, print_json
-from rlservo.export.contract.extras import needs_extra
+from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from rlservo.serve_app.client.admin_client import AdminClient
+    from rlservo.client.admin_client import AdminClient
     from rlservo.serve_app.server.offline_commands import OfflineCommands
 
 policy = typer.Typer(
@@ -66,6 +66,10 @@ def list_policies(
         print_json([shown, *({"replica": process, "generation": number} for process, number in others.items())])
         return
     terminal.output().print(table_of(shown))
+    for name, versions in shown["not_loaded"].items():
+        for version in versions:
+            line = f"not loaded: {name} {version} (rlservo policy load {name} {version})"
+            terminal.output().print(line, markup=False, highlight=False, soft_wrap=True)
     for sentence in shown["behind"]:
         terminal.output().print(f"behind: {sentence}", style="red", markup=False, highlight=False, soft_wrap=True)
     for process, number in others.items():
@@ -179,7 +183,7 @@ def shadow(
 @contextlib.contextmanager
 def _client(url: str, key_file: Path | None) -> Iterator[AdminClient]:
     with needs_extra("client"):
-        from rlservo.serve_app.client.admin_client import AdminClient, find_key
+        from rlservo.client.admin_client import AdminClient, find_key
     with AdminClient(url, api_key=find_key(url, key_file)) as client:
         yield client
 
@@ -211,6 +215,8 @@ def _give(
         lines.append(f"shadow {reply['shadow']}")
     lines.append(f"plan {reply['generation']}" + (f" in {reply['place']}" if "place" in reply else ""))
     terminal.output().print("; ".join(lines), markup=False, highlight=False, soft_wrap=True)
+    for sentence in reply["notes"]:
+        terminal.note(sentence)
 
 
 def table_of(replica: dict[str, Any]) -> Table:

@@ -1,4 +1,4 @@
-"""The command `rlservo policy promote`; the work is in serve_app/client/promotion.py."""
+"""The command `rlservo policy promote`; the work is in rlservo/client/promotion.py."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.policy import LOCAL, KeyFile, Name
 from rlservo.deploy.terminal import Json, print_json
-from rlservo.export.contract.errors import RlservoError, UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.errors import RlservoError, UsageError
+from rlservo.extras import needs_extra
 
 PERCENT = {"%": 0.01}
 SECONDS = {"ms": 1e-3, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -45,7 +45,7 @@ def promote(
         typer.Option(metavar="SHARE", help="Allowed drop in the share of successful episodes below production's: 2%."),
     ] = None,
     min_requests: Annotated[
-        int, typer.Option(min=1, help="Requests (or compared actions) required for a decision.")
+        int, typer.Option(min=1, help="Requests (or compared actions) required for a decision; at least 1 / limit are.")
     ] = 100,
     min_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each version required for a decision.")] = 20,
     log: Annotated[
@@ -71,18 +71,18 @@ def promote(
 
     Example: `rlservo policy promote ur5 2 --canary 10% --for 10m --max-error-rate 0.1% --max-p99 20ms`
     """
-    from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN
+    from rlservo.bundle.contract import NAME_PATTERN, VERSION_PATTERN
 
     with needs_extra("client"):
-        from rlservo.serve_app.client.admin_client import AdminClient, find_key
-        from rlservo.serve_app.client.promotion import EXIT_CODES, Promotion, Terms
-        from rlservo.serve_app.client.promotion_evidence import Limits
-        from rlservo.serve_app.client.promotion_log import PromotionLog
+        from rlservo.client.admin_client import AdminClient, find_key
+        from rlservo.client.promotion import EXIT_CODES, Promotion, Terms
+        from rlservo.client.promotion_evidence import PromotionLimits
+        from rlservo.client.promotion_log import PromotionLog
 
     for text, pattern, what in ((name, NAME_PATTERN, "policy name"), (version, VERSION_PATTERN, "version")):
         if re.fullmatch(pattern, text) is None:  # both become part of a file's name
             raise UsageError(f"{text[:80]!r} is not a {what}")
-    limits = Limits(
+    limits = PromotionLimits(
         error_rate=parse_number("--max-error-rate", max_error_rate, PERCENT, 1.0),
         p99_s=parse_number("--max-p99", max_p99, SECONDS, 1.0),
         action_difference=max_action_difference,
@@ -90,7 +90,7 @@ def promote(
         min_requests=min_requests,
         min_episodes=min_episodes,
     )
-    if limits == Limits(min_requests=min_requests, min_episodes=min_episodes):
+    if limits == PromotionLimits(min_requests=min_requests, min_episodes=min_episodes):
         raise UsageError(
             "no limit was given: give --max-error-rate, --max-p99, --max-action-difference or --max-success-drop"
         )

@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rlservo.deploy import terminal
+from rlservo.deploy.commands.bundle_folder import FOLDER, Version, bundle_of
 from rlservo.deploy.commands.log import Files, PolicyName
 from rlservo.deploy.terminal import Json, print_json
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.errors import UsageError
+from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.replay.estimate import EstimateReport
-    from rlservo.serve_app.replay.replay import ReplayReport
+    from rlservo.recording.replay.estimate import EstimateReport
+    from rlservo.recording.replay.replay import ReplayReport
 
-Bundle = Annotated[Path, typer.Option(help="Bundle folder, or a policy folder for its newest version.")]
+Bundle = Annotated[Path, typer.Option(help=FOLDER)]
 
 
 def replay(
@@ -27,6 +28,7 @@ def replay(
     tolerance: Annotated[
         float, typer.Option(min=0.0, help="Largest difference in an element that does not count as a change.")
     ] = 0.0,
+    version: Version = None,
     policy: PolicyName = None,
     as_json: Json = False,
 ) -> None:
@@ -37,12 +39,12 @@ def replay(
     Example: `rlservo replay run.mcap --bundle policies/ur5/2`
     """
     with needs_extra("record"):
-        from rlservo.serve_app.recording.reader import Recording
-        from rlservo.serve_app.replay.replay import replay as run_replay
+        from rlservo.recording.reader import Recording
+        from rlservo.recording.replay.replay import replay as run_replay
 
-    began = time.perf_counter()
+    chosen, began = bundle_of(bundle, version), time.perf_counter()
     with terminal.status("replaying the recordings"):
-        report = run_replay(Recording(files), bundle, tolerance=tolerance, name=policy)
+        report = run_replay(Recording(files), chosen, tolerance=tolerance, name=policy)
     seconds = time.perf_counter() - began
     if as_json:
         print_json({**report.as_dict(), "seconds": round(seconds, 3)})
@@ -59,28 +61,30 @@ def estimate(
         bool, typer.Option("--explore", help="Estimate the exploring policy instead of the deterministic one.")
     ] = False,
     gamma: Annotated[float, typer.Option(help="Discount per step.")] = 1.0,
+    version: Version = None,
     policy: PolicyName = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of the bootstrap.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Estimate a bundle's return from another's recordings.
 
-    Recordings without exploration only allow fitted Q evaluation. It is experimental: its interval's coverage was
-    measured only in a one-dimensional simulation. Do not base a decision to drive on it.
+    The recorded actions must have explored (`rlservo rollout --explore`). A deterministic policy is estimated only if
+    its actions are discrete.
 
     Exit code 0: an estimate passes its method's own checks; 1: the recordings cannot support one.
 
-    Example: `rlservo estimate recordings --bundle policies/ur5/2`
+    Example: `rlservo estimate recordings --bundle policies/ur5/2 --explore`
     """
     if not 0 < gamma <= 1:
         raise UsageError(f"--gamma must be above 0 and at most 1, got {gamma:g}")
     with needs_extra("record"):
-        from rlservo.serve_app.recording.reader import Recording
-        from rlservo.serve_app.replay.estimate import estimate as run_estimate
+        from rlservo.recording.reader import Recording
+        from rlservo.recording.replay.estimate import estimate as run_estimate
 
+    chosen = bundle_of(bundle, version)
     with terminal.status("reading the recordings") as show:
         report = run_estimate(
-            Recording(files), bundle, explore=explore, gamma=gamma, name=policy, seed=seed, progress=show
+            Recording(files), chosen, explore=explore, gamma=gamma, name=policy, seed=seed, progress=show
         )
     if as_json:
         print_json(report.as_dict())
@@ -128,7 +132,11 @@ def _print_replay(report: ReplayReport, seconds: float) -> None:
 def _print_estimate(report: EstimateReport) -> None:
     _line(f"{report.bundle} ({report.target}) from {report.episodes} episodes of {', '.join(report.policies)}")
     assert report.recorded_return is not None and report.recorded_interval is not None
-    _line(f"recorded return {report.recorded_return:.5g}  {_interval(report.recorded_interval)}")
+    several = len(report.recorded_by_policy) > 1
+    together = f" of {len(report.recorded_by_policy)} versions together" if several else ""
+    _line(f"recorded return{together} {report.recorded_return:.5g}  {_interval(report.recorded_interval)}")
+    for title, (episodes, mean) in report.recorded_by_policy.items() if several else ():
+        _line(f"  {title}: {mean:.5g} in {episodes} episodes")
     for reason, count in report.not_used.items():
         _line(f"not used: {count} episodes {reason}")
     for one in report.estimates:

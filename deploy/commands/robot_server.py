@@ -13,11 +13,11 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.environment_options import parse_env_arguments, require_robot
 from rlservo.deploy.terminal import Json, print_json, show_log
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.errors import UsageError
+from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
-    from rlservo.envs.robot_server.settings import Settings
+    from rlservo.envs.robot_server.robot_server_settings import Settings
 
 robot_server = typer.Typer(
     help="Serve a robot to robo-gym, without ROS.",
@@ -72,7 +72,7 @@ def robot_server_ur(
     ] = "mujoco",
     limit: Limit = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Real arm: move to a SetState's pose without confirmation here.")
+        bool, typer.Option("--yes", help="Real arm: move to SetState's poses without confirmation here.")
     ] = False,
     metrics: Annotated[
         str | None,
@@ -93,8 +93,8 @@ def robot_server_ur(
     Example: `rlservo robot-server ur --ur-model ur5 --rs-mode 1object --action-cycle-rate 10 --port 50051`, then
     `gym.make("EndEffectorPositioningURRob-v0", rs_address="127.0.0.1:50051", ur_model="ur5")` in robo-gym
     """
-    with _one_sentence_errors():
-        from rlservo.envs.robot_server.settings import URSettings
+    with one_sentence_errors():
+        from rlservo.envs.robot_server.robot_server_settings import URSettings
 
         settings = URSettings(
             host=host,
@@ -141,8 +141,8 @@ def robot_server_panda(
     Example: `rlservo robot-server panda --rs-mode 1object --port 50051`, then
     `gym.make("EndEffectorPositioningPandaRob-v0", rs_address="127.0.0.1:50051")` in robo-gym 2.1
     """
-    with _one_sentence_errors():
-        from rlservo.envs.robot_server.settings import PandaSettings
+    with one_sentence_errors():
+        from rlservo.envs.robot_server.robot_server_settings import PandaSettings
 
         settings = PandaSettings(
             host=host,
@@ -172,8 +172,8 @@ def robot_server_mir100(
 
     Example: `rlservo robot-server mir100 --world lab_6x8 --port 50051`
     """
-    with _one_sentence_errors():
-        from rlservo.envs.robot_server.settings import Mir100Settings
+    with one_sentence_errors():
+        from rlservo.envs.robot_server.robot_server_settings import Mir100Settings
 
         settings = Mir100Settings(host=host, port=port, clock=clock, gui=gui, seed=seed, world=world)
         _serve(settings, f"MiR100, world {world}, 10 Hz")
@@ -185,7 +185,7 @@ def server_manager(
         int | None, typer.Option(min=1, max=65535, help="Port; the first free one of 50100 to 50199 by default.")
     ] = None,
     clock: Clock = "fast",
-    max_servers: Annotated[int, typer.Option(min=1, help="Most robot servers that may run at once.")] = 100,
+    max_servers: Annotated[int, typer.Option(min=1, help="Limit of robot servers that run at once.")] = 100,
     orphan_timeout: Annotated[
         float, typer.Option(min=0.0, help="Seconds without a client after which a robot server exits; 0: never.")
     ] = 120.0,
@@ -195,7 +195,7 @@ def server_manager(
     Example: `rlservo server-manager`, then
     `gym.make("EndEffectorPositioningURSim-v0", ip="127.0.0.1", ur_model="ur5")` in robo-gym
     """
-    with _one_sentence_errors():
+    with one_sentence_errors():
         from rlservo.envs.robot_server.manager import serve_manager
 
         def ready(bound: int) -> None:
@@ -229,18 +229,19 @@ def robot_latency(
     Example: `rlservo robot-latency rtde://192.168.0.2 --ur-model ur5e`
     """
     require_robot(robot)
-    with _one_sentence_errors():
-        from rlservo.envs.robots.arm import RobotError, host_of
-        from rlservo.envs.robots.latency import STEP, measure_latency
-        from rlservo.envs.robots.limits import Limits
-        from rlservo.envs.robots.operator_terminal import Operator
-        from rlservo.envs.robots.rtde_arm import RtdeArm
+    with one_sentence_errors():
+        from rlservo.robots.arm_interface import RobotError, host_of
+        from rlservo.robots.arm_process import ArmProcess
+        from rlservo.robots.kept_latency import keep_latency_ms
+        from rlservo.robots.latency import STEP, measure_latency
+        from rlservo.robots.limits import Limits
+        from rlservo.robots.operator_terminal import Operator
 
         host = host_of(robot)
         if host is None:
             raise RobotError(f"robot {robot!r} is simulated: expected rtde://HOST or ros2:")
         Operator(is_asked=not yes).confirm(f"wrist_3 of the robot at {host} turns by {STEP:g} rad, {steps} times")
-        arm = RtdeArm(host, ur_model, setpoint_timeout_s=0.5, limits=Limits.of(parse_env_arguments(limit or [])))
+        arm = ArmProcess(host, ur_model, setpoint_timeout_s=0.5, limits=Limits.of(parse_env_arguments(limit or [])))
         try:
             with terminal.status(f"0 of {steps} motions") as show:
                 report = measure_latency(
@@ -248,6 +249,7 @@ def robot_latency(
                 )
         finally:
             arm.close()
+        keep_latency_ms(robot, ur_model, report.max_ms)
     if as_json:
         print_json(dataclasses.asdict(report) | {"disturbance": report.disturbance})
         return
@@ -279,9 +281,10 @@ def ur_controller(
     Example: `rlservo ur-controller --model ur5e`, then `rtde_control.RTDEControlInterface("127.0.0.1")` in Python;
     `help` and Enter lists the commands
     """
-    with _one_sentence_errors():
-        from rlservo.envs.ur_controller.controller import Controller
-        from rlservo.envs.ur_controller.server import Link, run
+    with one_sentence_errors():
+        from rlservo.robots.simulated.ur_controller.console import run
+        from rlservo.robots.simulated.ur_controller.controller import Controller
+        from rlservo.robots.simulated.ur_controller.controller_server import LinkFaults
 
         def ready() -> None:
             terminal.output().print(
@@ -293,11 +296,11 @@ def ur_controller(
 
         stop = threading.Event()
         with terminal.ctrl_c_sets(stop):
-            run(Controller(model), host, Link(latency_ms / 1e3, jitter_ms / 1e3, drop), stop, ready)
+            run(Controller(model), host, LinkFaults(latency_ms / 1e3, jitter_ms / 1e3, drop), stop, ready)
 
 
 def _serve(settings: Settings, title: str) -> None:
-    from rlservo.envs.robot_server.server import serve_robot
+    from rlservo.envs.robot_server.robot_server import serve_robot
 
     def ready(port: int) -> None:
         terminal.output().print(f"robot server on {settings.host}:{port}: {title}; Ctrl-C stops it", highlight=False)
@@ -306,7 +309,7 @@ def _serve(settings: Settings, title: str) -> None:
 
 
 @contextmanager
-def _one_sentence_errors() -> Iterator[None]:
+def one_sentence_errors() -> Iterator[None]:
     """Convert the simulators' errors to those of the command line, and name a missing extra."""
     show_log()
     try:

@@ -9,15 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from rlservo.deploy import terminal
-from rlservo.deploy.commands.environment_options import choose_gl_backend, parse_env_arguments, require_robot
+from rlservo.deploy.commands.bundle_folder import bundle_of
+from rlservo.deploy.commands.environment_options import Target, choose_gl_backend, parse_env_arguments, require_robot
 from rlservo.deploy.terminal import Json, print_json, show_log
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra, require
+from rlservo.errors import UsageError
+from rlservo.extras import needs_extra, require
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.interface import ActingPolicy
+    from rlservo.policy.acting_policy import ActingPolicy
 
 TransportKind = Literal["http", "ws"]
+VersionOrAlias = Annotated[
+    str | None,
+    typer.Option(help="Version or alias, with --bundle a version or 'newest'; by default the one in production."),
+]
 
 
 def rollout(
@@ -25,6 +30,7 @@ def rollout(
     url: Annotated[str | None, typer.Option(help="Server that gives the actions.")] = None,
     policy: Annotated[str | None, typer.Option(help="Policy name on that server; by default its only policy.")] = None,
     bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle instead of a server.")] = None,
+    version: VersionOrAlias = None,
     episodes: Annotated[int, typer.Option(min=1)] = 10,
     seed: Annotated[int | None, typer.Option(help="Seed; episode i is reset with seed + i.")] = None,
     rate: Annotated[
@@ -36,6 +42,7 @@ def rollout(
     env_arg: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Environment constructor argument (JSON value).")
     ] = None,
+    target: Target = None,
     video: Annotated[Path | None, typer.Option(help="Write the first episode to this .mp4 file.")] = None,
     transport: Annotated[
         TransportKind, typer.Option(help="http: one JSON request per action; ws: one WebSocket.")
@@ -67,7 +74,16 @@ def rollout(
             help="Disturbances to drive under, such as latency=3,noise=real,payload=3; see `rlservo verify -h`.",
         ),
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Real robot: move to a start without confirmation.")] = False,
+    app_dir: Annotated[
+        Path, typer.Option(help="Folder of the Python module that registers your environment.")
+    ] = Path(),
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Real robot: move without confirmation; after a stop it asks nevertheless.")
+    ] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Real arm: show start, path, speeds and end of one episode; nothing moves."),
+    ] = False,
     unproven: Annotated[
         bool, typer.Option("--unproven", help="Real robot: accept a policy without an evaluation under latency.")
     ] = False,
@@ -75,13 +91,18 @@ def rollout(
 ) -> None:
     """Drive an environment with a policy. Reports success, return, latency and deadline misses.
 
-    Example: `rlservo rollout rlservo/EndEffectorPositioningURSim-v0 --url http://127.0.0.1:8000 --policy ur5`
+    Examples: `rlservo rollout rlservo/EndEffectorPositioningURSim-v0 --url http://127.0.0.1:8000 --policy ur5`,
+    `rlservo rollout my_module:MyEnv-v0 --bundle policies/mine --app-dir my_project`
     """
     if (url is None) == (bundle is None):
         raise UsageError("expected either --url (a server) or --bundle (in process)")
     if bundle is not None and (fallback, deadline_ms, transport) != (None, None, "http"):
         raise UsageError("--transport, --deadline-ms and --fallback need a server (--url)")
-    arguments = parse_env_arguments(env_arg or []) | ({"confirm": False} if yes else {})
+    arguments = parse_env_arguments(env_arg or [], target) | ({"confirm": False} if yes else {})
+    if dry_run:
+        if "robot" not in arguments:
+            raise UsageError("--dry-run needs a real arm (--env-arg robot=...): anything else moves nothing anyway")
+        arguments, episodes, unproven, rate = arguments | {"dry_run": True}, 1, True, "max"
     if "robot" in arguments:
         require_robot(str(arguments["robot"]))
         show_log()
@@ -89,13 +110,16 @@ def rollout(
         choose_gl_backend()
     if record is not None:
         require("record", "mcap", "orjson")
+    from rlservo.export.checkpoints.unpickle import user_code
+
     with needs_extra("sim", "gymnasium", *(("imageio", "imageio_ffmpeg") if video else ())):
-        from rlservo.serve_app.rollout.control_loop import rollout as run_rollout
-        from rlservo.serve_app.rollout.report import render_report
+        from rlservo.drive.control_loop import rollout as run_rollout
+        from rlservo.drive.report import render_report
 
     with (
+        user_code(app_dir),
         terminal.status(f"0 of {episodes} episodes") as show,
-        acting_policy(url, policy, bundle, transport, deadline_ms, server_state, api_key) as acting,
+        acting_policy(url, policy, bundle, version, transport, deadline_ms, server_state, api_key) as acting,
     ):
         report = run_rollout(
             with_fallback(acting, fallback),
@@ -125,6 +149,7 @@ def acting_policy(
     url: str | None,
     name: str | None,
     bundle: Path | None,
+    version: str | None,
     transport: TransportKind,
     deadline_ms: float | None,
     server_state: bool,
@@ -132,22 +157,22 @@ def acting_policy(
 ) -> ActingPolicy:
     """Return the policy; in process it needs no HTTP client."""
     if bundle is not None:
-        from rlservo.serve_app.runtime.compiled_policy import open_policy
+        from rlservo.policy.compiled_policy import open_policy
 
-        return open_policy(bundle)
+        return open_policy(bundle_of(bundle, version))
     with needs_extra("client"):
-        from rlservo.serve_app.client.policy_client import PolicyClient
-        from rlservo.serve_app.client.stream_client import StreamClient
+        from rlservo.client.policy_client import PolicyClient
+        from rlservo.client.stream_client import StreamClient
 
     kind = StreamClient if transport == "ws" else PolicyClient
-    return kind(str(url), name, deadline_ms=deadline_ms, server_state=server_state, api_key=api_key)
+    return kind(str(url), name, version=version, deadline_ms=deadline_ms, server_state=server_state, api_key=api_key)
 
 
 def with_fallback(policy: ActingPolicy, fallback: str | None) -> ActingPolicy:
     """Return the policy with the fallback for late actions. Raises UsageError."""
     if fallback is None:
         return policy
-    from rlservo.serve_app.rollout.fallback import WithFallback
+    from rlservo.drive.fallback import WithFallback
 
     if fallback in ("hold", "zero", "stop"):
         return WithFallback(policy, fallback)

@@ -13,16 +13,17 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.environment_options import parse_env_arguments
-from rlservo.deploy.commands.rollout import TransportKind, acting_policy, with_fallback
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra, require
+from rlservo.deploy.commands.rollout import TransportKind, VersionOrAlias, acting_policy, with_fallback
+from rlservo.errors import UsageError
+from rlservo.extras import needs_extra, require
 
 if TYPE_CHECKING:
-    from rlservo.envs.ros2.link import Topics
+    from rlservo.robots.ros2.link import Topics
 
 
 def ros2(
     bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle.")] = None,
+    version: VersionOrAlias = None,
     url: Annotated[str | None, typer.Option(help="Server that gives the actions.")] = None,
     policy: Annotated[str | None, typer.Option(help="Policy name on that server; by default its only policy.")] = None,
     robot: Annotated[
@@ -70,15 +71,16 @@ def ros2(
     _pass_ros_arguments(ros_args or [], mapping)
     with needs_extra("sim", "mujoco", "gymnasium"):
         from rlservo.deploy.ros2.node import PolicyNode, drive_elements, drive_environment, real_environment
-        from rlservo.envs.robots.arm import RobotError
+        from rlservo.robots.arm_interface import RobotError
     if record is not None:
         require("record", "mcap", "orjson")
     with ExitStack() as cleanup:
         cleanup.enter_context(terminal.ends_like_ctrl_c())  # until the robot is connected, which may take a minute
-        acting: Any = cleanup.enter_context(acting_policy(url, policy, bundle, transport, deadline_ms, False, None))
+        opened = acting_policy(url, policy, bundle, version, transport, deadline_ms, False, None)
+        acting: Any = cleanup.enter_context(opened)
         acting = with_fallback(acting, fallback)
         if record is not None:
-            from rlservo.serve_app.recording.start import record_policy
+            from rlservo.recording.start import record_policy
 
             acting = record_policy(acting, record)
             cleanup.callback(acting.end)
@@ -123,26 +125,26 @@ def ros2_sim(
         raise UsageError("--no-ros needs --rosbridge-port: otherwise the robot has no link")
     terminal.show_log()
     with needs_extra("sim", "mujoco"):
-        from rlservo.envs.robots.arm import RobotError
-        from rlservo.envs.ros2.simulation_loop import SimulatedRobot, run
-        from rlservo.envs.ur_controller.server import Link as LinkFaults
+        from rlservo.robots.arm_interface import RobotError
+        from rlservo.robots.simulated.ros2_loop import SimulatedRobot, run
+        from rlservo.robots.simulated.ur_controller.controller_server import LinkFaults as LinkFaults
     where = []
     stop = threading.Event()
     simulated: SimulatedRobot
     with ExitStack() as cleanup:
         try:
             if robot == "mir100":
-                from rlservo.envs.ros2.simulated_base import SimulatedBase
+                from rlservo.robots.simulated.ros2_base import SimulatedBase
 
                 links: list[Topics] = []
                 if ros:
-                    from rlservo.envs.ros2.rclpy_link import RclpyLink
+                    from rlservo.robots.ros2.rclpy_link import RclpyLink
 
                     links.append(RclpyLink("mir100_sim", is_unique=True))
                     where.append("ROS 2")
                 if rosbridge_port is not None:
                     with needs_extra("client", "websockets"):
-                        from rlservo.envs.ros2.rosbridge_server import RosbridgeServer
+                        from rlservo.robots.simulated.rosbridge_server import RosbridgeServer
                     bridge = RosbridgeServer("127.0.0.1", rosbridge_port)
                     links.append(bridge)
                     where.append(f"rosbridge://127.0.0.1:{bridge.port}")
@@ -150,7 +152,7 @@ def ros2_sim(
                 simulated = base
                 cleanup.callback(base.close)
             else:
-                from rlservo.envs.ros2.simulated_arm import SimulatedArm
+                from rlservo.robots.simulated.ros2_arm import SimulatedArm
 
                 arm = SimulatedArm(robot, controller=controller, prefix=prefix, faults=LinkFaults())
                 simulated = arm

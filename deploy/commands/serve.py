@@ -10,8 +10,8 @@ import typer
 
 from rlservo.deploy import terminal
 from rlservo.deploy.terminal import note
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.errors import UsageError
+from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
     pass
@@ -46,6 +46,9 @@ ShadowOption = Annotated[
         "--shadow", metavar="NAME=VERSION", help="Version that runs in parallel, only for comparison of its actions."
     ),
 ]
+
+
+MOST_SHOWN = 10  # bundles that are not served, in the lines of a start
 
 
 def serve(
@@ -98,15 +101,19 @@ def serve(
     `curl -d '{"obs": [0, 0, 0]}' -H 'content-type: application/json' 127.0.0.1:8000/v1/policies/NAME/act`
     """
     with needs_extra("serve"):
+        from rlservo.client.formats.admin_key_file import key_file
         from rlservo.serve_app.engines.uvicorn_server import RunningServer, serve_policies
-        from rlservo.serve_app.wire.admin_key_file import key_file
     if record is not None:
         with needs_extra("record"):
-            import rlservo.serve_app.recording.log_file  # noqa: F401
+            import rlservo.recording.log_file  # noqa: F401
 
     def ready(served: RunningServer) -> None:
         for name, default in served.policies:
             terminal.show(f"{served.url}/v1/policies/{name}  (version {default})")
+        for sentence in served.not_served[:MOST_SHOWN]:
+            terminal.show(sentence)
+        if len(served.not_served) > MOST_SHOWN:
+            terminal.show(f"... and {len(served.not_served) - MOST_SHOWN} more bundles (rlservo policy list)")
         if served.grpc is not None:
             terminal.show(f"{served.grpc}  gRPC, Open Inference Protocol")
         if served.admin_key_file is not None:

@@ -12,22 +12,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rlservo.bundle.environment_id import plain_id
 from rlservo.deploy import terminal
+from rlservo.deploy.commands.bundle_folder import FOLDER, Version, bundle_of
 from rlservo.deploy.commands.environment_options import parse_env_arguments
 from rlservo.deploy.terminal import Json, note, print_json
-from rlservo.export.contract.environment_id import plain_id
-from rlservo.export.contract.errors import ParityError, UsageError
-from rlservo.export.contract.extras import needs_extra
+from rlservo.errors import ParityError, UsageError
+from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
-    from rlservo.serve_app.rollout.disturbance_table import DisturbanceTable
+    from rlservo.drive.disturbance_table import DisturbanceTable
 
 EPISODES = 100  # of each row by default
 WIDTH = 140  # [characters], smallest width of the table: in a narrower one the figures wrap
 
 
 def verify(
-    bundle: Annotated[Path, typer.Argument(help="Bundle folder, or a policy folder for its newest version.")],
+    bundle: Annotated[Path, typer.Argument(help=FOLDER)],
     disturbances: Annotated[
         list[str] | None,
         typer.Argument(
@@ -41,7 +42,10 @@ def verify(
     checkpoint: Annotated[str | None, typer.Option(help="Checkpoint to compare with; a path or a URI.")] = None,
     source: Annotated[str | None, typer.Option(help="Trainer that wrote --checkpoint; detected by default.")] = None,
     vecnormalize: Annotated[
-        Path | None, typer.Option(help="Stable-Baselines3: vecnormalize.pkl, if it is not beside the checkpoint.")
+        Path | None,
+        typer.Option(
+            help="Stable-Baselines3: vecnormalize.pkl, if it is not beside the checkpoint; `none` as in the export."
+        ),
     ] = None,
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
     disturb: Annotated[
@@ -68,7 +72,8 @@ def verify(
     write: Annotated[
         bool, typer.Option("--write", help="With --disturb: write the rows to the contract as evaluations.")
     ] = False,
-    app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
+    app_dir: Annotated[Path, typer.Option(help="Folder of the modules that the checkpoint and --env need.")] = Path(),
+    version: Version = None,
     as_json: Json = False,
 ) -> None:
     """Prove a bundle against its checkpoint again. With --env, also drive episodes and add them to the contract.
@@ -89,28 +94,44 @@ def verify(
     env = env and plain_id(env)
     if checkpoint is None and not disturb and compiled is None:
         raise UsageError("expected --checkpoint to compare the bundle with, or --env with --disturb or --compiled")
-    document: dict[str, Any] = {}
+    from rlservo.bundle.bundle import digest_of
+    from rlservo.export.checkpoints.unpickle import user_code
+
+    bundle, document = bundle_of(bundle, version), dict[str, Any]()
+    before = digest_of(bundle)
     if compiled is not None:
-        document |= _verify_compiled(compiled, bundle, env, episodes or 20, seed, env_arg or [], as_json)
+        with user_code(app_dir):
+            document |= _verify_compiled(compiled, bundle, env, episodes or 20, seed, env_arg or [], as_json)
     if checkpoint is not None:
         files = {"app_dir": app_dir, "source": source, "vecnormalize": vecnormalize}
         document |= _verify_against(checkpoint, bundle, env, episodes or 20, seed, files, as_json)
     if disturb:
-        table = _measure(
-            bundle,
-            env,
-            disturbances or [],
-            episodes=episodes,
-            seed=seed,
-            env_arguments=parse_env_arguments(env_arg or []),
-            plot=plot,
-            write=write,
-        )
+        with user_code(app_dir):
+            table = _measure(
+                bundle,
+                env,
+                disturbances or [],
+                episodes=episodes,
+                seed=seed,
+                env_arguments=parse_env_arguments(env_arg or []),
+                plot=plot,
+                write=write,
+            )
         document["disturbances"] = table.as_dict()
         if not as_json:
             _show(table)
+    if digest_of(bundle) != before:
+        _accept(bundle, before)
     if as_json:
         print_json(document)
+
+
+def _accept(bundle: Path, before: str) -> None:
+    """Have the plans that name the bundle's hash name the one with its new evaluations."""
+    from rlservo.serve_app.server.offline_commands import accept_evaluation
+
+    for place in accept_evaluation(bundle, before):
+        note(f"the plan in {place} has the bundle's new hash: servers start with it, running ones take it")
 
 
 def _verify_against(
@@ -123,8 +144,8 @@ def _verify_against(
 
     env_config = None
     if env is not None:  # the policy may have been trained with disturbances of this environment
+        from rlservo.bundle.bundle import load_bundle
         from rlservo.envs.randomization import wrapped_env
-        from rlservo.export.contract.bundle import load_bundle
 
         trained = load_bundle(bundle).contract.provenance
         if env != trained.env_id:
@@ -157,10 +178,10 @@ def _verify_compiled(
     if env_id is None:
         raise UsageError("--compiled needs --env, the environment to drive")
     with needs_extra("sim", "gymnasium"):
+        from rlservo.drive.control_loop import rollout
         from rlservo.envs.randomization import wrapped_env
-        from rlservo.serve_app.rollout.control_loop import rollout
-        from rlservo.serve_app.runtime.compiled_policy import CompiledPolicy
-        from rlservo.serve_app.runtime.policy import Policy
+        from rlservo.policy.compiled_policy import CompiledPolicy
+        from rlservo.policy.policy import Policy
 
     with Policy.load(bundle) as ours, CompiledPolicy(compiled) as theirs, terminal.status("driving both") as show:
         if ours.digest != theirs.digest:
@@ -213,15 +234,15 @@ def _measure(
     if seed < 0:
         raise UsageError(f"--seed is {seed}: expected 0 or more")
     with needs_extra("sim"):
-        from rlservo.envs.randomization import wrapped_env
-        from rlservo.export.contract.bundle import load_bundle, write_contract
-        from rlservo.serve_app.rollout.disturbance_table import (
+        from rlservo.bundle.bundle import load_bundle, write_contract
+        from rlservo.drive.disturbance_table import (
             check_plot,
             evaluations_of,
             measure_disturbances,
             plot_table,
         )
-        from rlservo.serve_app.runtime.policy import Policy
+        from rlservo.envs.randomization import wrapped_env
+        from rlservo.policy.policy import Policy
 
     if plot is not None:
         check_plot(plot)
@@ -253,7 +274,7 @@ def _measure(
 
 def _show(table: DisturbanceTable) -> None:
     """Print the table."""
-    from rlservo.serve_app.rollout.disturbance_table import render_table
+    from rlservo.drive.disturbance_table import render_table
 
     console = terminal.output()
     console.print(render_table(table), width=max(console.width, WIDTH), soft_wrap=True)

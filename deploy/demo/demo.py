@@ -26,13 +26,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from rlservo.deploy.demo.picture import Frame, Robot, RobotRun, Trace, draw_picture, film
+from rlservo.bundle.contract import Contract
+from rlservo.client.policy_client import PolicyClient
+from rlservo.deploy.demo.picture import DemoRobot, Frame, RobotRun, Trace, draw_picture, film
 from rlservo.deploy.terminal import ends_like_ctrl_c, show_command
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.interface import ActingPolicy, Observation
-from rlservo.serve_app.rollout.control_loop import rollout
+from rlservo.drive.control_loop import rollout
+from rlservo.errors import RlservoError, UnavailableError, UsageError
+from rlservo.policy.acting_policy import ActingPolicy, Observation
 
 FIRST_SEED = 10_000  # not among the seeds the policies were trained with
 START_TIMEOUT_S = 120.0
@@ -40,14 +40,14 @@ STOP_TIMEOUT_S = 30.0
 
 
 ROBOTS = (
-    Robot(
+    DemoRobot(
         policy="ur5",
         checkpoint="ur_positioning",
         env_id="rlservo/EndEffectorPositioningURSim-v0",
         title="UR5",
         success_distance_m=0.1,
     ),
-    Robot(
+    DemoRobot(
         policy="mir100",
         checkpoint="mir100_navigation",
         env_id="rlservo/NoObstacleNavigationMir100Sim-v0",

@@ -10,19 +10,19 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.interface import ActingPolicy
-from rlservo.serve_app.rollout.environment import make_env
-from rlservo.serve_app.rollout.episode import run_episode
-from rlservo.serve_app.rollout.report import RolloutReport
-from rlservo.serve_app.rollout.video import FilmedEnv
+from rlservo.drive.driven_episode import run_episode
+from rlservo.drive.make_environment import make_env
+from rlservo.drive.report import RolloutReport
+from rlservo.drive.video import FilmedEnv
+from rlservo.errors import UsageError
+from rlservo.policy.acting_policy import ActingPolicy
 
 Trace: TypeAlias = list[float]  # distance to the target [m] before each action of one episode
 Frame: TypeAlias = NDArray[np.uint8]  # (height, width, 3)
 
 
 @dataclass(frozen=True)
-class Robot:
+class DemoRobot:
     """One shipped policy and the simulator it drives."""
 
     policy: str
@@ -36,7 +36,7 @@ class Robot:
 class RobotRun:
     """Run of one robot in the demo; `frames` is empty if the machine cannot draw."""
 
-    robot: Robot
+    robot: DemoRobot
     report: RolloutReport
     traces: list[Trace]
     frames: list[Frame]

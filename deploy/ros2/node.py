@@ -2,29 +2,45 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import re
 import threading
 import time
 from collections.abc import Callable, Mapping
 from enum import Enum
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from rlservo.deploy.ros2.elements import COMMANDED, READ, ElementInputs, ElementOutputs, places
-from rlservo.envs.robots.arm import RobotError
-from rlservo.envs.ros2.link import take_command
-from rlservo.envs.ros2.messages import DIAGNOSTICS, POSE_STAMPED, stamp
-from rlservo.envs.ros2.rclpy_link import RclpyLink
-from rlservo.envs.ur.parameters import JOINTS
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import DeadlineError, RlservoError, UsageError
-from rlservo.serve_app.interface import ActingPolicy
-from rlservo.serve_app.rollout.environment import check_fit, check_proven, make_env
+from rlservo.bundle.contract import Contract
+from rlservo.deploy.ros2.mapped_elements import (
+    COMMANDED,
+    READ,
+    ElementInputs,
+    ElementOutputs,
+    PresentPositions,
+    check_conventions,
+    places,
+)
+from rlservo.drive.driven_episode import report_step
+from rlservo.drive.make_environment import check_fit, check_proven, make_env
+from rlservo.errors import DeadlineError, RlservoError, UsageError
+from rlservo.policy.acting_policy import ActingPolicy
+from rlservo.robots.arm_interface import RobotError
+from rlservo.robots.operator_terminal import Operator
+from rlservo.robots.ros2.link import take_command
+from rlservo.robots.ros2.rclpy_link import RclpyLink
+from rlservo.robots.ros2.ros_messages import DIAGNOSTICS, POSE_STAMPED, stamp
+from rlservo.robots.ur.parameters import JOINTS
 
 HEARTBEAT_S = 0.5
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # DiagnosticStatus' levels
+LEVELS = {
+    **dict.fromkeys(("holding", "hold", "blocked", "waiting", "refused", "human"), WARN),
+    **dict.fromkeys(("failed", "fault"), ERROR),
+}
 # Environments of ours by the simulated one that a policy was trained in, and the frame of their target.
 REAL = {
     "EndEffectorPositioningURSim-v0": ("EndEffectorPositioningURRob-v0", "ee_target_pose", "base_link"),
@@ -68,6 +84,7 @@ class PolicyNode:
         self.state, self.why = "waiting", ""
         self.counts: dict[str, int] = {"decisions": 0, "episodes": 0, "successes": 0, "held": 0, "late": 0}
         self.wanted = Wanted.RUN if autostart else Wanted.STOP
+        self.starts = 0  # calls of the start service: a person's
         self._diagnose = self.link.advertise("/diagnostics", DIAGNOSTICS)
         self._is_closed = threading.Event()
         for word in Wanted:
@@ -78,9 +95,9 @@ class PolicyNode:
         self._thread.start()
 
     def parameters(self) -> dict[str, str]:
-        """Return the parameters that map elements: `observation.NAME` and `action.NAME`."""
+        """Return the parameters that map elements: `observation.NAME`, `action.NAME` and `stop.NAME`."""
         found: dict[str, str] = {}
-        for side in ("observation", "action"):
+        for side in ("observation", "action", "stop"):
             for name, parameter in self.link.node.get_parameters_by_prefix(side).items():
                 found[f"{side}.{name}"] = str(parameter.value)
         return found
@@ -100,6 +117,7 @@ class PolicyNode:
     def _setter(self, word: Wanted) -> Callable[[], tuple[bool, str]]:
         def answer() -> tuple[bool, str]:
             self.wanted = word
+            self.starts += word is Wanted.RUN
             return True, f"{word.value} (was {self.state})"
 
         return answer
@@ -108,7 +126,7 @@ class PolicyNode:
         while not self._is_closed.wait(HEARTBEAT_S):
             contract = self.policy.contract
             facts = {"state": self.state, "policy": contract.name, "version": contract.version, **self.counts}
-            level = {"fault": ERROR, "holding": WARN, "waiting": WARN, "refused": WARN}.get(self.state, OK)
+            level = LEVELS.get(self.state, OK)
             status = {
                 "level": level,
                 "name": f"{self.link.node.get_fully_qualified_name()}: policy",
@@ -121,7 +139,7 @@ class PolicyNode:
 
 def drive_elements(node: PolicyNode, *, rate_hz: float | None, max_age_s: float | None) -> None:
     """Drive a robot by the contract's element names until the node is stopped. Raises UsageError, RobotError."""
-    policy, contract = node.policy, node.policy.contract
+    contract = node.policy.contract
     rate_hz = rate_hz or contract.control_rate_hz
     if rate_hz is None:
         raise UsageError(f"policy {contract.name!r} states no control rate: give --rate")
@@ -129,13 +147,27 @@ def drive_elements(node: PolicyNode, *, rate_hz: float | None, max_age_s: float 
     for side, numbers in ((observed, READ), (acted, COMMANDED)):
         for place in side:
             place.check(numbers)
+    check_conventions(contract, observed, acted, node.link.node.resolve_topic_name)
+    present = PresentPositions.of(contract, observed)
     inputs = ElementInputs(node.link, observed, max_age_s or max(0.1, 2.0 / rate_hz))
     kinds, name_of = {place.topic: place.kind for place in acted}, node.link.node.resolve_topic_name
     publishers = {topic: take_command(node.link, name_of(topic), kind)[1] for topic, kind in kinds.items()}
     outputs = ElementOutputs(acted, publishers, node.link.now_s)
     node.on_connected()
+    try:
+        _drive_elements(node, inputs, outputs, present, rate_hz)
+    finally:
+        with contextlib.suppress(RobotError):  # another node commands it now
+            outputs.stop()
+
+
+def _drive_elements(
+    node: PolicyNode, inputs: ElementInputs, outputs: ElementOutputs, present: PresentPositions, rate_hz: float
+) -> None:
+    policy = node.policy
     due, was_running = time.monotonic(), False
     while not node.stop.is_set():
+        is_acting = False
         due = max(due + 1.0 / rate_hz, time.monotonic())
         observation, why = inputs.observe()
         if node.wanted is not Wanted.RUN:
@@ -154,12 +186,15 @@ def drive_elements(node: PolicyNode, *, rate_hz: float | None, max_age_s: float 
                 action = np.asarray(policy.act(observation))
                 if (took_s := time.monotonic() - began) > inputs.max_age_s:
                     raise DeadlineError(f"the action came {took_s:.2f} s late, more than {inputs.max_age_s:g} s")
-                outputs.act(action)
+                outputs.act(present.targets(action, observation))
+                is_acting = True
                 node.enter("running")
                 node.counts["decisions"] += 1
-            except RlservoError as error:  # late, unreachable, refused: nothing is commanded in this cycle
+            except RlservoError as error:  # late, unreachable, refused
                 node.enter("holding", error.message)
                 node.counts["late"] += 1
+        if not is_acting:
+            outputs.stop()
         time.sleep(max(0.0, due - time.monotonic()))
 
 
@@ -189,19 +224,34 @@ def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str,
         check_fit(node.policy.contract, env, arguments)
         if not unproven:
             check_proven(node.policy.contract, env)
-        target = _Target(frame)
-        node.link.subscribe("~/target", POSE_STAMPED, target.take)
         robot: Any = env.unwrapped
+        target = _Target(robot.simulation.frame if frame == "odom" else frame)
+        node.link.subscribe("~/target", POSE_STAMPED, target.take)
+        for word, to_person in (("take_over", True), ("hand_back", False)):
+            node.link.serve(f"~/{word}", partial(_lead, robot.simulation.operator, to_person=to_person))
         robot.simulation.is_called_off = lambda: node.stop.is_set() or node.wanted is not Wanted.RUN
+        starts = node.starts
         while not node.stop.is_set():
+            if node.state != "fault":
+                starts = node.starts
+            elif node.starts > starts:
+                robot.simulation.operator.allow_restart()
+                node.enter("waiting", "started again")
+                robot.simulation.stopped_by = None
+            else:
+                if target.number != target.done:
+                    log.warning("node: a target was ignored: the robot has stopped; call the start service first")
+                target.done = target.number
+                robot.simulation.advance()
+                continue
             if node.wanted is not Wanted.RUN:
                 node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
-            elif robot.simulation.operator.has_taken_over:
-                node.enter("human")
+            elif robot.simulation.is_led:
+                node.enter(robot.simulation.states.state.value)
             elif target.number == target.done:
-                if robot.simulation.stopped_by is not None and node.state != "fault":  # while it stood
+                if robot.simulation.stopped_by is not None:  # while it stood
                     node.enter("fault", robot.simulation.stopped_by)
-                elif node.state not in ("arrived", "fault", "refused"):
+                elif node.state not in ("arrived", "failed", "refused"):
                     node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
             else:
                 _drive_to(node, env, option, target)
@@ -209,6 +259,13 @@ def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str,
             robot.simulation.advance()  # the model stays where the robot is
     finally:
         env.close()
+
+
+def _lead(operator: Operator, *, to_person: bool) -> tuple[bool, str]:
+    """Answer a service: let a person lead the robot once it is at rest, or give it back to the policy."""
+    if operator.has_taken_over != to_person:
+        operator.toggle()
+    return True, "the state is human once the robot may be led" if to_person else "given back"
 
 
 def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
@@ -220,6 +277,10 @@ def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
     robot, policy = env.unwrapped, node.policy
     number, position = target.number, target.pose
     goal = [position.x, position.y, position.z] if option == "ee_target_pose" else [position.x, position.y]
+    if not np.isfinite(goal).all():  # an arm would return to its start before it is noticed
+        node.enter("refused", f"the target is {', '.join(f'{value:g}' for value in goal)} m: expected finite numbers")
+        target.done = number
+        return
     goal += [0.0] * ((6 if option == "ee_target_pose" else 3) - len(goal))
     if target.begun != number:
         node.enter("starting")
@@ -229,7 +290,7 @@ def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
     except ValueError as error:
         if not robot.simulation.is_called_off():
             node.enter("fault" if isinstance(error, RobotError) else "refused", str(error))
-            target.done = number  # a robot must not move by itself once its fault is mended: a new target is needed
+            target.done = number  # a robot must not move by itself: a new target is needed, after a fault a start too
         return
     target.begun = number
     policy.reset()
@@ -245,23 +306,26 @@ def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
             return
         node.counts["episodes"] += is_first
         is_first = False
-        observation, reward, terminated, truncated, info = env.step(action)
+        step = env.step(action)
+        report_step(policy, step)
+        observation, _, terminated, truncated, info = step
         node.counts["decisions"] += 1
-        is_over = terminated or truncated
-        if report := getattr(policy, "outcome", None):  # of a recording, or a server that counts
-            policy.robot = info["robot"]  # type: ignore[attr-defined]  # only a recording has it
-            report(
-                float(reward), terminated=terminated, truncated=truncated, final_status=info.get("final_status"),
-                final_obs=observation if is_over else None,
-            )  # fmt: skip
-        node.enter("running" if info["robot"]["state"] in ("run", "blend_in") else info["robot"]["state"])
-        if is_over:
+        state, blocked = info["robot"]["state"], info["robot"].get("blocked", "")
+        if terminated or truncated:
             robot.simulation.hold()
-            status = info["final_status"]
             node.counts["successes"] += bool(info["is_success"])
-            log.info("node: target %d: %s", number, status)
-            is_fault = robot.simulation.stopped_by is not None
-            node.enter("fault" if is_fault else "arrived", status)
+            log.info("node: target %d: %s", number, info["final_status"])
+            if robot.simulation.stopped_by is not None:
+                causes = [change["why"] for change in info["robot"].get("changes", []) if change["state"] == "fault"]
+                node.enter("fault", (causes or [info["final_status"]])[-1])
+            elif info["is_success"]:
+                node.enter("arrived", info["final_status"])
+            else:
+                node.enter("failed", info["final_status"] + (f", blocked: {blocked}" if blocked else ""))
             target.done = number
             return
+        if state in ("run", "blend_in"):
+            node.enter("blocked" if blocked else "running", blocked)
+        else:
+            node.enter(state)
     robot.simulation.hold()

@@ -1,1 +1,1 @@
-"""The MiR100 mobile robot: one simulation, and the environments over it."""
+"""Tasks of the MiR100 mobile robot."""

@@ -15,21 +15,21 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import ElementInfo, EnvDescription, as_vector, check_action, check_option_names
-from rlservo.envs.disturbances import SensorError
-from rlservo.envs.mir100.lasers import pick_beams
-from rlservo.envs.mir100.parameters import (
+from rlservo.envs.mir100.sensor_errors import sensor_errors
+from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv, Start
+from rlservo.robots.arm_interface import MUJOCO
+from rlservo.robots.checks import ElementInfo, EnvDescription, as_vector, check_action, check_option_names, parse_target
+from rlservo.robots.disturbable import SensorError
+from rlservo.robots.mir100.lasers import pick_beams
+from rlservo.robots.mir100.parameters import (
     CYCLE_S,
     LASER_MAX,
     LASER_NOISE,
     MAX_ANGULAR_VELOCITY,
     MAX_LINEAR_VELOCITY,
 )
-from rlservo.envs.mir100.sensor_errors import sensor_errors
-from rlservo.envs.mir100.simulation import Mir100Simulation, wrap_angle
-from rlservo.envs.mir100.worlds import Pose
-from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv, Start
-from rlservo.envs.robots.arm import MUJOCO
+from rlservo.robots.mir100.simulation import Mir100Simulation, wrap_angle
+from rlservo.robots.mir100.worlds import Pose
 
 LINEAR_SCALE, ANGULAR_SCALE = 0.5, 0.7  # [m/s], [rad/s], of an action of 1
 SUCCESS_DISTANCE = 0.2  # [m]
@@ -39,6 +39,10 @@ VELOCITY_TOLERANCE = 0.1  # [m/s], [rad/s], of the observation bounds above the 
 PROGRESS_REWARD = 50.0  # [1/m]
 LINEAR_COST, ANGULAR_COST = 0.30, 0.03  # of an action of 1
 FAILURE_REWARD = -200.0
+TARGET_FORMS = {
+    "odom": ("X,Y",),
+    "base_link": ("X,Y",),
+}  # of `target`; odom: simulated, the map
 
 Observation = NDArray[np.float32]
 Vector = NDArray[np.float64]
@@ -72,10 +76,12 @@ class Mir100Navigation(RenderedEnv):
         robot: str = MUJOCO,
         limits: Mapping[str, Any] | None = None,
         confirm: bool = True,
+        target: str | None = None,
     ) -> None:
         del ip, lower_bound_port, upper_bound_port, rs_address  # no robot server to reach
         del rs_state_to_info  # robo-gym's MiR100 environments accept it and put nothing into info either
         super().__init__(render_mode, gui=gui)
+        self._given = None if target is None else parse_target(target, TARGET_FORMS)
         self.is_real = robot != MUJOCO
         self.simulation = self._build(robot, laser_noise, limits, confirm)
         self._elements = self.describe()["action"]
@@ -110,18 +116,25 @@ class Mir100Navigation(RenderedEnv):
     @classmethod
     def describe(cls, **_constructor_arguments: Any) -> EnvDescription:
         """Name the elements, without building a simulator; no constructor argument changes them."""
+        frame = "base_link"
         observation: list[ElementInfo] = [
-            {"name": "target_r", "unit": "m"},
-            {"name": "target_theta", "unit": "rad"},
-            {"name": "linear_velocity", "unit": "m/s"},
-            {"name": "angular_velocity", "unit": "rad/s"},
+            {"name": "target_r", "unit": "m", "quantity": "distance", "frame": frame},
+            {"name": "target_theta", "unit": "rad", "quantity": "direction", "frame": frame},
+            {"name": "linear_velocity", "unit": "m/s", "quantity": "linear velocity", "axis": "x", "frame": frame},
+            {"name": "angular_velocity", "unit": "rad/s", "quantity": "angular velocity", "axis": "z", "frame": frame},
         ]
-        lasers: list[ElementInfo] = [{"name": f"laser_{index}", "unit": "m"} for index in range(cls.LASER_COUNT)]
-        action: list[ElementInfo] = [
-            {"name": "linear_velocity_normalized", "unit": "1"},
-            {"name": "angular_velocity_normalized", "unit": "1"},
+        lasers: list[ElementInfo] = [
+            {"name": f"laser_{index}", "unit": "m", "quantity": "distance"} for index in range(cls.LASER_COUNT)
         ]
-        return {"observation": observation + lasers, "action": action, "control_rate_hz": 1.0 / CYCLE_S}
+        linear: ElementInfo = {
+            "name": "linear_velocity_normalized", "unit": "1", "quantity": "linear velocity", "axis": "x",
+            "scale": LINEAR_SCALE, "offset": 0.0, "frame": frame,
+        }  # fmt: skip
+        angular: ElementInfo = {
+            "name": "angular_velocity_normalized", "unit": "1", "quantity": "angular velocity", "axis": "z",
+            "scale": ANGULAR_SCALE, "offset": 0.0, "frame": frame,
+        }  # fmt: skip
+        return {"observation": observation + lasers, "action": [linear, angular], "control_rate_hz": 1.0 / CYCLE_S}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -132,9 +145,9 @@ class Mir100Navigation(RenderedEnv):
         check_option_names(options, self.RESET_OPTIONS)
         start_pose, target_pose = options.get("start_pose"), options.get("target_pose")
         start = self._random_start() if start_pose is None else as_vector("start_pose", start_pose, 3).tolist()
-        target = self._random_target(start) if target_pose is None else as_vector("target_pose", target_pose, 3)
+        target = self._own_target(start) if target_pose is None else as_vector("target_pose", target_pose, 3).tolist()
         self.simulation.rng = self.np_random
-        self._place(start, target.tolist() if isinstance(target, np.ndarray) else target, options)
+        self._place(start, target, options)
         self._steps = 0
         self._previous_distance = None
         self._refresh_window()
@@ -282,9 +295,23 @@ class Mir100Navigation(RenderedEnv):
     ) -> Mir100Simulation:
         if robot == MUJOCO:
             return Mir100Simulation(self.WORLD, laser_noise=laser_noise)
-        from rlservo.envs.ros2.mirrored_base import MirroredMir100
+        from rlservo.robots.ros2.real_base import RealMir100
 
-        return MirroredMir100(robot, needs_scan=self.LASER_COUNT > 0, limits=limits or {}, confirm=confirm)
+        return RealMir100(
+            robot,
+            needs_scan=self.LASER_COUNT > 0,
+            fastest=(LINEAR_SCALE, ANGULAR_SCALE),
+            limits=limits or {},
+            confirm=confirm,
+        )
+
+    def _own_target(self, start: Sequence[float]) -> Pose:
+        """Return the constructor's target, or a random one."""
+        if self._given is None:
+            return self._random_target(start)
+        frame, numbers = self._given
+        x, y = numbers.tolist()
+        return (x, y, 0.0) if frame == "odom" else from_base(start, x, y)
 
     def _random_target(self, start: Sequence[float]) -> Pose:
         while True:
@@ -315,6 +342,12 @@ class Mir100Navigation(RenderedEnv):
         if self.LASER_COUNT:
             observation[4:] = self.simulation.scan[self.observed_beams]
         return observation
+
+
+def from_base(base: Sequence[float], x: float, y: float) -> Pose:
+    """Return the pose of a place of the base's frame [m], where the base stands at x, y [m] and yaw [rad]."""
+    x0, y0, yaw = base
+    return x0 + x * math.cos(yaw) - y * math.sin(yaw), y0 + x * math.sin(yaw) + y * math.cos(yaw), 0.0
 
 
 def _dead_reckoning(observations: Vector) -> Pose:

@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rlservo.envs.disturbances import Extreme
 from rlservo.envs.mir100.navigation import Mir100Navigation
-from rlservo.envs.mir100.worlds import EMPTY, Pose
+from rlservo.robots.disturbable import Extreme
+from rlservo.robots.mir100.worlds import EMPTY, Pose
 
 BOUNDARY = 10.0  # [m], from the origin
 

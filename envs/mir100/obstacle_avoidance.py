@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rlservo.envs.checks import InvalidResetError, as_vector
-from rlservo.envs.disturbances import Extreme
 from rlservo.envs.mir100.navigation import Mir100Navigation
-from rlservo.envs.mir100.parameters import LENGTH, WIDTH
-from rlservo.envs.mir100.simulation import ROOM_VIEW
-from rlservo.envs.mir100.worlds import LAB_6X8, Pose
 from rlservo.envs.rendering import Start
+from rlservo.robots.checks import InvalidResetError, as_vector
+from rlservo.robots.disturbable import Extreme
+from rlservo.robots.mir100.parameters import LENGTH, WIDTH
+from rlservo.robots.mir100.simulation import ROOM_VIEW
+from rlservo.robots.mir100.worlds import LAB_6X8, Pose
 
 SAFETY_RADIUS = 0.40  # [m], of a corner of the robot from a cube's centre
 MIN_READING = 0.15  # [m]

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 
-from rlservo.envs.disturbances import SensorError
-from rlservo.envs.mir100.parameters import CYCLE_S, LASER_NOISE, WHEEL_SEPARATION
+from rlservo.robots.disturbable import SensorError
+from rlservo.robots.mir100.parameters import CYCLE_S, LASER_NOISE, WHEEL_SEPARATION
 
 POSE_BIAS = 0.05  # [m]
 POSE_NOISE = POSE_BIAS / 3  # [m]

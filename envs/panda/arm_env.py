@@ -9,12 +9,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.envs.panda.model import HIGH, JOINTS, LOW
+from rlservo.envs.elements import joint_elements
 from rlservo.envs.panda.server_state import state_dict
-from rlservo.envs.panda.simulation import PandaSimulation
 from rlservo.envs.ur.arm_env import POSITION_BOUND, ArmEnv, Observation, Vector
-from rlservo.envs.ur.model import Table
-from rlservo.envs.ur.parameters import cycle_of
+from rlservo.robots.checks import ElementInfo
+from rlservo.robots.panda.model import HIGH, JOINTS, LOW
+from rlservo.robots.panda.simulation import PandaSimulation
+from rlservo.robots.ur.model import Table
+from rlservo.robots.ur.parameters import cycle_of
 
 CENTRE: Vector = 0.5 * (np.array(LOW) + np.array(HIGH))  # [rad]
 HALF: Vector = 0.5 * (np.array(HIGH) - np.array(LOW))
@@ -24,6 +26,7 @@ class PandaArmEnv(ArmEnv[PandaSimulation]):
     """Move the Panda by one position per joint and cycle. A normalised position is -1 .. 1 between a joint's limits."""
 
     JOINTS = JOINTS
+    JOINT_NAMES: ClassVar[Mapping[str, str]] = {joint: joint for joint in JOINTS}
     LOW, HIGH = np.array(LOW), np.array(HIGH)
     BASE = np.zeros(3)
     FIXED: ClassVar[tuple[str, ...]] = ("panda_joint7",)
@@ -80,6 +83,15 @@ class PandaArmEnv(ArmEnv[PandaSimulation]):
     def _rs_state(self) -> dict[str, float]:
         return state_dict(self.simulation, self.RS_MODE)
 
+    @classmethod
+    def _joint_state_elements(cls) -> list[ElementInfo]:
+        positions = joint_elements(cls.JOINT_NAMES, *cls.ACTION_ELEMENT, "joint position", HALF, CENTRE)
+        return positions + joint_elements(cls.JOINT_NAMES, "velocity", "rad/s", "joint velocity")
+
+    @classmethod
+    def _position_map(cls, **_arguments: Any) -> tuple[Vector, Vector]:
+        return HALF, CENTRE
+
     def _fixed_values(self) -> Vector:
         return (self._start - CENTRE) / HALF
 
@@ -125,9 +137,8 @@ class EmptyEnvironmentPandaSim(PandaArmEnv):
     TABLE = False
 
     @classmethod
-    def _observation_elements(cls) -> list[tuple[str, str]]:
-        observation = [(f"{joint}_position_normalized", "1") for joint in JOINTS]
-        return observation + [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
+    def _observation_elements(cls) -> list[ElementInfo]:
+        return cls._joint_state_elements()
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         high = np.concatenate([np.full(7, POSITION_BOUND), np.full(7, np.inf)])

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import as_vector
-from rlservo.envs.disturbances import SensorError
+from rlservo.envs.elements import point_elements, polar_elements
 from rlservo.envs.panda.arm_env import CENTRE, HALF, PandaArmEnv
-from rlservo.envs.panda.model import HIGH, JOINTS, LOW
 from rlservo.envs.ur.arm_env import POSITION_BOUND, Observation, Vector, polar
 from rlservo.envs.ur.sensor_errors import JOINT_BIAS, JOINT_NOISE, VELOCITY_NOISE, polar_errors, position_errors
+from rlservo.robots.checks import ElementInfo, as_vector
+from rlservo.robots.disturbable import SensorError
+from rlservo.robots.panda.model import HIGH, JOINTS, LOW
 
 TARGET_LOW, TARGET_HIGH = np.array([0.35, -0.2, 0.15]), np.array([0.65, 0.2, 0.5])  # [m]
 START_RANGE = (1.5, 0.25, 0.5, 1.0, 0.4, 3.14, 1.0)  # [rad], +-, with randomize_start
@@ -86,12 +87,9 @@ class EndEffectorPositioningPandaSim(PandaArmEnv):
         self._command: Vector = np.zeros(7)
 
     @classmethod
-    def _observation_elements(cls) -> list[tuple[str, str]]:
-        observation = [("target_r", "m"), ("target_theta", "rad"), ("target_phi", "rad")]
-        observation += [(f"{joint}_position_normalized", "1") for joint in JOINTS]
-        observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
-        observation += [(f"target_{axis}", "m") for axis in "xyz"]
-        return observation + [(f"ee_{axis}", "m") for axis in "xyz"]
+    def _observation_elements(cls) -> list[ElementInfo]:
+        observation = polar_elements("target", "panda_hand") + cls._joint_state_elements()
+        return observation + point_elements("target", "panda_link0") + point_elements("ee", "panda_link0")
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         infinite, one = np.full(7, np.inf), np.ones(len(self._free))

@@ -5,9 +5,9 @@ Source: jr-robotics/robo-gym-robot-servers, panda_robot_server. Joints are `join
 
 from __future__ import annotations
 
-from rlservo.envs.panda.simulation import PandaSimulation
 from rlservo.envs.ur.rs_modes import transform_names
 from rlservo.envs.ur.server_state import object_transform, transform
+from rlservo.robots.panda.simulation import PandaSimulation
 
 RS_MODES = {"only_robot": 0, "1object": 1}  # objects in the state
 STATE_JOINTS = tuple(f"joint{number}" for number in range(1, 8))

@@ -13,7 +13,13 @@ import shlex
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rlservo.envs.robot_server.settings import MAX_OBJECTS, Mir100Settings, PandaSettings, Settings, URSettings
+from rlservo.envs.robot_server.robot_server_settings import (
+    MAX_OBJECTS,
+    Mir100Settings,
+    PandaSettings,
+    Settings,
+    URSettings,
+)
 
 # Accepted, without effect.
 WINDOWS = {"gui", "rviz_gui", "gazebo_gui", "rviz_config_path", "rviz_config_file"}

@@ -12,12 +12,12 @@ from typing import Any
 import grpc
 
 from rlservo.envs.robot_server.launch_line import parse_launch_line
-from rlservo.envs.robot_server.messages import SERVER_MANAGER, ManagerStatus, ServerRequest
+from rlservo.envs.robot_server.robo_gym_messages import SERVER_MANAGER, ManagerStatus, ServerRequest
+from rlservo.envs.robot_server.robot_server import OPTIONS, PortInUseError, arrives, bind, stop_signals
+from rlservo.envs.robot_server.robot_server_process import ServerProcess
+from rlservo.envs.robot_server.robot_server_settings import PandaSettings, Settings, URSettings
 from rlservo.envs.robot_server.robots.robot import CLOCKS
 from rlservo.envs.robot_server.rpc_handler import rpc_handler
-from rlservo.envs.robot_server.server import OPTIONS, PortInUseError, arrives, bind, stop_signals
-from rlservo.envs.robot_server.server_process import ServerProcess
-from rlservo.envs.robot_server.settings import PandaSettings, Settings, URSettings
 
 MANAGER_PORTS = range(50100, 50200)  # robo-gym's clients look for a manager here, in this order
 MAX_SERVERS = 100
@@ -66,7 +66,7 @@ class RobotServers:
         settings = parse_launch_line(line, gui=gui, clock=self._clock, host=self._host)
         with self._lock:
             if self._closing.is_set():
-                raise ValueError("this server manager is ending")
+                raise ValueError("this server manager is shutting down")
             if len(self._running) + self._starting >= self._max_servers:
                 raise ValueError(f"{self._max_servers} robot servers are running, which is this manager's limit")
             self._starting += 1
@@ -84,7 +84,7 @@ class RobotServers:
                 log.info("%s on port %d (process %d)", _title(settings), server.port, server.pid)
                 return server.port
         server.end()
-        raise ValueError("this server manager is ending")
+        raise ValueError("this server manager is shutting down")
 
     def kill(self, port: int) -> None:
         """End the robot server on `port`; one that has ended already is no error. Raises ValueError for other ports."""

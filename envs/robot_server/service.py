@@ -13,8 +13,8 @@ from typing import Any
 import grpc
 
 from rlservo.envs.robot_server.clock import Clock
-from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, Empty, State, Success
-from rlservo.envs.robot_server.robots.robot import Robot, RobotState
+from rlservo.envs.robot_server.robo_gym_messages import ROBOT_SERVER, Action, Empty, State, Success
+from rlservo.envs.robot_server.robots.robot import RobotState, ServedRobot
 from rlservo.envs.robot_server.rpc_handler import rpc_handler
 
 log = logging.getLogger("rlservo.robot_server")
@@ -23,7 +23,7 @@ log = logging.getLogger("rlservo.robot_server")
 class RobotService:
     """The four calls. One command at a time; looking at the state never waits for a cycle to end."""
 
-    def __init__(self, robot: Robot, clock: Clock, *, gui: bool = False) -> None:
+    def __init__(self, robot: ServedRobot, clock: Clock, *, gui: bool = False) -> None:
         self._robot, self._clock, self._gui = robot, clock, gui
         self._state_lock = threading.Lock()  # held while the simulation runs
         self._turn = threading.Lock()  # held by a command until its cycle is over

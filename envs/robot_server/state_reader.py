@@ -8,15 +8,15 @@ import grpc
 import numpy as np
 
 from rlservo.envs.mir100.navigation import Mir100Navigation
-from rlservo.envs.mir100.parameters import BEAM_COUNT
 from rlservo.envs.panda.arm_env import PandaArmEnv
 from rlservo.envs.panda.server_state import STATE_JOINTS
 from rlservo.envs.rendering import RenderedEnv
-from rlservo.envs.robot_server.messages import ROBOT_SERVER, Empty, State
+from rlservo.envs.robot_server.robo_gym_messages import ROBOT_SERVER, Empty, State
 from rlservo.envs.robot_server.robots.mir100 import CUBES, ROBOT, STATE_LENGTH, TARGET
 from rlservo.envs.robot_server.robots.robot import RobotState
 from rlservo.envs.ur.arm_env import BASE, LIMITS, URArmEnv
-from rlservo.envs.ur.parameters import JOINTS
+from rlservo.robots.mir100.parameters import BEAM_COUNT
+from rlservo.robots.ur.parameters import JOINTS
 
 SCAN = slice(8, 8 + BEAM_COUNT)
 PANDA = [f"{joint}_position" for joint in STATE_JOINTS]

@@ -16,27 +16,37 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import (
+from rlservo.envs.elements import joint_elements
+from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
+from rlservo.envs.ur.server_state import state_dict
+from rlservo.robots.arm_interface import MUJOCO
+from rlservo.robots.checks import (
     ElementInfo,
     EnvDescription,
     InvalidResetError,
     as_vector,
     check_action,
     check_option_names,
-    element,
+    parse_target,
 )
-from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
-from rlservo.envs.robots.arm import MUJOCO
-from rlservo.envs.robots.connect import make_arm
-from rlservo.envs.ur.model import BASE_HEIGHT, Table
-from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
-from rlservo.envs.ur.server_state import state_dict
-from rlservo.envs.ur.simulation import VIEW, ArmSimulation, URSimulation
+from rlservo.robots.connect_arm import make_arm
+from rlservo.robots.kept_latency import kept_latency_ms
+from rlservo.robots.ur.model import BASE_HEIGHT, Table
+from rlservo.robots.ur.parameters import JOINT_NAMES, JOINTS, POSITION_LIMITS, cycle_of
+from rlservo.robots.ur.simulation import VIEW, ArmSimulation, URSimulation
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 BASE: NDArray[np.float64] = np.array([0.0, 0.0, BASE_HEIGHT])  # [m], base_link in MuJoCo's world
 POSITION_BOUND = 1.1  # of a normalised joint position: its limit and robo-gym's tolerance
 REDRAWS = 1000  # of a random start that collides; about one in ten does
+
+# Of `target`: the frame base_link, the pendant's base (base_link turned by half a turn), or a pose's joints.
+TARGET_FORMS = {
+    "base_link": ("X,Y,Z", "X,Y,Z,ROLL,PITCH,YAW"),
+    "base": ("X,Y,Z", "X,Y,Z,ROLL,PITCH,YAW"),
+    "joints": ("BASE,SHOULDER,ELBOW,WRIST_1,WRIST_2,WRIST_3",),
+}
+FRONT = math.pi / 4  # [rad], on either side of base_link's x axis, of a real arm's random targets
 
 Observation = NDArray[np.float32]
 Vector = NDArray[np.float64]
@@ -50,6 +60,7 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012
 
     JOINTS: ClassVar[tuple[str, ...]]
+    JOINT_NAMES: ClassVar[Mapping[str, str]]  # names in the URDF, by JOINTS
     LOW: ClassVar[Vector]  # [rad], of JOINTS
     HIGH: ClassVar[Vector]
     BASE: ClassVar[Vector]  # [m], the arm's base in MuJoCo's world
@@ -96,6 +107,7 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         self._camera = Camera(self.simulation.model, self.simulation.data, **VIEW)
         self._start: Vector = np.array(self.START_JOINTS)
         self._steps = 0
+        self._options: Mapping[str, Any] = {}  # of this episode's reset
         self._base_offset: Vector = np.zeros(3)  # [m]
 
     @classmethod
@@ -105,11 +117,11 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         fixed = cls._fixed_joints(choices)
         elements = cls._observation_elements()
         if cls.OBSERVES_LAST_ACTION:
-            free = [joint for joint, is_fixed in zip(cls.JOINTS, fixed, strict=True) if not is_fixed]
-            elements += [(f"{joint}_last_action", "1") for joint in free]
+            last = joint_elements(cls.JOINT_NAMES, "last_action", "1", "last action")
+            elements += [one for one, is_fixed in zip(last, fixed, strict=True) if not is_fixed]
         return {
-            "observation": [element(name, unit) for name, unit in elements],
-            "action": cls._action_elements(fixed),
+            "observation": elements,
+            "action": cls._action_elements(fixed, **arguments),
             "control_rate_hz": cls.RATE_HZ if action_cycle_rate is None else action_cycle_rate,
         }
 
@@ -120,7 +132,7 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         super().reset(seed=seed)
         options = options or {}
         check_option_names(options, self.RESET_OPTIONS)
-        self._steps = 0
+        self._steps, self._options = 0, options
         self._start = self._place_arm(options)
         self._begin(options)
         self._refresh_window()
@@ -192,8 +204,13 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
 
     @classmethod
     @abstractmethod
-    def _observation_elements(cls) -> list[tuple[str, str]]:
-        """Return name and unit of each observation element."""
+    def _observation_elements(cls) -> list[ElementInfo]:
+        """Describe each observation element."""
+
+    @classmethod
+    @abstractmethod
+    def _position_map(cls, **arguments: Any) -> tuple[Vector, Vector | None]:
+        """Return scale and offset [rad] by which actions are joint positions; an offset that varies is None."""
 
     @abstractmethod
     def _observation_bounds(self) -> tuple[Vector, Vector]:
@@ -236,12 +253,12 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         ]
 
     @classmethod
-    def _action_elements(cls, fixed: Sequence[bool]) -> list[ElementInfo]:
-        """Name the elements of an action: one for each joint that is not fixed."""
-        name, unit = cls.ACTION_ELEMENT
-        return [
-            element(f"{joint}_{name}", unit) for joint, is_fixed in zip(cls.JOINTS, fixed, strict=True) if not is_fixed
-        ]
+    def _action_elements(cls, fixed: Sequence[bool], **arguments: Any) -> list[ElementInfo]:
+        """Describe the elements of an action: one for each joint that is not fixed."""
+        elements = joint_elements(
+            cls.JOINT_NAMES, *cls.ACTION_ELEMENT, "joint position", *cls._position_map(**arguments)
+        )
+        return [one for one, is_fixed in zip(elements, fixed, strict=True) if not is_fixed]
 
     def _place_arm(self, options: Mapping[str, Any]) -> Vector:
         """Put the arm at the options' start and return it."""
@@ -279,11 +296,14 @@ class URArmEnv(ArmEnv[URSimulation]):
     """Move a UR arm, simulated or real."""
 
     JOINTS = JOINTS
+    JOINT_NAMES = JOINT_NAMES
     LOW, HIGH = -LIMITS, LIMITS
     BASE = BASE
     FIXED: ClassVar[tuple[str, ...]] = ("wrist_3",)
     TOOL: ClassVar[str] = "tool0"
     TABLE: ClassVar[Table]
+    WITHIN: ClassVar[float] = 0.0  # [m], of the target, for a success; 0: a task without a target
+    TARGET_TURN: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # [rad], roll, pitch and yaw, of one given as a position
 
     def __init__(
         self,
@@ -304,6 +324,8 @@ class URArmEnv(ArmEnv[URSimulation]):
         limits: Mapping[str, Any] | None = None,
         confirm: bool = True,
         metrics: str | None = None,
+        target: str | None = None,
+        dry_run: bool = False,
         rs_address: str | None = None,
         ip: str | None = None,
         lower_bound_port: int | None = None,
@@ -311,6 +333,9 @@ class URArmEnv(ArmEnv[URSimulation]):
     ) -> None:
         """The arguments are described in the tasks' docstrings; None takes the task's own value."""
         del rs_address, ip, lower_bound_port, upper_bound_port  # no robot server to reach
+        if target is not None and not self.WITHIN:
+            raise ValueError(f"{type(self).__name__} has no target")
+        given = None if target is None else parse_target(target, TARGET_FORMS)
         choices = (fix_base, fix_shoulder, fix_elbow, fix_wrist_1, fix_wrist_2, fix_wrist_3)
         scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
         rate_hz = self.RATE_HZ if action_cycle_rate is None else action_cycle_rate
@@ -320,6 +345,7 @@ class URArmEnv(ArmEnv[URSimulation]):
             limits=limits,
             confirm=confirm,
             metrics=metrics,
+            dry_run=dry_run,
             max_velocity_scale=scale,
             cycle_s=cycle_of(rate_hz),
             objects=self.OBJECTS,
@@ -327,6 +353,8 @@ class URArmEnv(ArmEnv[URSimulation]):
             tool=self.TOOL,
         )
         self.is_real = robot != MUJOCO
+        self.robot_facts = {"ur_model": ur_model, "action_cycle_rate": rate_hz, "max_velocity_scale_factor": scale}
+        self.robot_address = robot
         super().__init__(
             partial(self._build, ur_model),
             fixed=self._fixed_joints(choices),
@@ -336,6 +364,10 @@ class URArmEnv(ArmEnv[URSimulation]):
             render_mode=render_mode,
         )
         self._simulations = {ur_model: self.simulation}  # an arm that is chosen again is not built again
+        self._given = None if given is None else self._pose_of(*given)
+        self._aimed: Vector | None = None  # the target that a real arm's operator was asked about
+        if self.is_real and self.WITHIN:
+            self.simulation.aim = self._aim
 
     def close(self) -> None:
         """Free the GL context, close the window, and stop a real arm."""
@@ -357,8 +389,68 @@ class URArmEnv(ArmEnv[URSimulation]):
         """Let a person lead a real arm by hand, or give it back. Raises ValueError for a simulated one."""
         self.simulation.take_over()
 
+    @property
+    def measured_latency_ms(self) -> float | None:
+        """The worst latency that `robot-latency` has measured on this real arm; None if it has not."""
+        return kept_latency_ms(self.robot_address, str(self.robot_facts["ur_model"]))
+
     def _rs_state(self) -> dict[str, float]:
         return state_dict(self.simulation, self.RS_MODE)
+
+    # -- the target of a task that has one: x, y, z [m] and roll, pitch, yaw [rad] in base_link
+
+    def _random_pose(self) -> Vector:
+        """Draw a target (6,)."""
+        raise NotImplementedError
+
+    def _target_pose(self) -> Vector:
+        """Return this episode's target (6,): the reset option's, the constructor's, or a random one."""
+        pose = self._asked_pose()
+        if pose is None:
+            pose = self._random_pose() if self._aimed is None else self._aimed
+        return pose
+
+    def _asked_pose(self) -> Vector | None:
+        pose = self._options.get("ee_target_pose")
+        return self._given if pose is None else as_vector("ee_target_pose", pose, 6)
+
+    def _pose_of(self, frame: str, numbers: Vector) -> Vector:
+        if frame == "joints":
+            position, axes, _ = self.simulation.tool_frame_at(numbers)
+            return np.concatenate([position, roll_pitch_yaw(axes)])
+        pose = np.concatenate([numbers, self.TARGET_TURN])[:6]
+        return pose if frame == "base_link" else pose * (-1, -1, 1, 1, 1, 1) + (0, 0, 0, 0, 0, math.pi)
+
+    def _aim(self, start: Vector) -> str:
+        """Choose a real arm's target before it moves to `start` [rad] (6,). Raises InvalidResetError, naming why not.
+
+        A random one is in front of the robot, and neither at its start nor out of its reach.
+        """
+        asked, tool = self._asked_pose(), self.simulation.tool_at(start)[0]
+        words, why = "in front of the robot", "it is too near to the start"
+        for _ in range(REDRAWS):
+            pose = self._random_pose() if asked is None else asked
+            x, y, _z = pose[:3].tolist()
+            if asked is None and (abs(math.atan2(y, x)) > FRONT or math.dist(tool, pose[:3]) < 2.0 * self.WITHIN):
+                continue
+            words = "(" + ", ".join(f"{value:.2f}" for value in pose[:3] + 0.0) + ") m in base_link"
+            why = self.simulation.unreachable(
+                pose[:3], start, within=self.WITHIN, time_s=self.MAX_STEPS / self.metadata["render_fps"]
+            )
+            if not why:
+                self._aimed = pose
+                return words
+            if asked is not None:
+                break
+        raise InvalidResetError(f"the target {words} cannot be reached: {why}")
+
+
+def roll_pitch_yaw(axes: Vector) -> Vector:
+    """Return rotations about the fixed axes x, y and z [rad] (3,), of a rotation matrix (3, 3)."""
+    pitch = math.asin(max(-1.0, min(1.0, -axes[2, 0])))
+    if math.cos(pitch) < 1e-6:  # roll and yaw turn about the same axis
+        return np.array([0.0, pitch, math.atan2(-axes[0, 1], axes[1, 1])])
+    return np.array([math.atan2(axes[2, 1], axes[2, 2]), pitch, math.atan2(axes[1, 0], axes[0, 0])])
 
 
 def polar(point: Vector) -> tuple[float, float, float]:

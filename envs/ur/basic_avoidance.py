@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import InvalidResetError, as_vector
-from rlservo.envs.disturbances import SensorError
+from rlservo.envs.elements import joint_elements, polar_elements
 from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
-from rlservo.envs.ur.object_paths import object_path
-from rlservo.envs.ur.parameters import JOINTS
 from rlservo.envs.ur.sensor_errors import joint_errors, polar_errors
+from rlservo.robots.checks import ElementInfo, InvalidResetError, as_vector
+from rlservo.robots.disturbable import SensorError
+from rlservo.robots.ur.object_paths import object_path
+from rlservo.robots.ur.parameters import JOINT_NAMES
 
 OBJECT_X, OBJECT_Y = 0.12, 0.34  # [m]
 Z_AMPLITUDE_RANGE, Z_OFFSET_RANGE, Z_FREQUENCY = (0.09, 0.35), (0.2, 0.6), 0.125  # [m], [m], [Hz]
@@ -104,12 +105,15 @@ class BasicAvoidanceURSim(URArmEnv):
         self._previous_action: Vector = np.zeros(6)
 
     @classmethod
-    def _observation_elements(cls) -> list[tuple[str, str]]:
-        observation = [("object_r", "m"), ("object_theta", "rad"), ("object_phi", "rad")]
-        observation += [(f"{joint}_position_normalized", "1") for joint in JOINTS]
-        observation += [(f"{joint}_offset_normalized", "1") for joint in JOINTS]
-        observation += [("object_to_elbow_r", "m"), ("object_to_elbow_theta", "rad"), ("object_to_elbow_phi", "rad")]
-        return observation
+    def _observation_elements(cls) -> list[ElementInfo]:
+        observation = polar_elements("object", "tool0")
+        observation += joint_elements(JOINT_NAMES, "position_normalized", "1", "joint position", LIMITS, np.zeros(6))
+        observation += joint_elements(JOINT_NAMES, "offset_normalized", "1", "joint position", LIMITS)
+        return observation + polar_elements("object_to_elbow", "forearm_link")
+
+    @classmethod
+    def _position_map(cls, **_arguments: Any) -> tuple[Vector, None]:
+        return np.ones(6), None  # from the start, which `joint_positions` chooses
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         elbow = np.full(3, np.inf) if self._include_polar_to_elbow else np.zeros(3)

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlservo.envs.elements import joint_elements
 from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector
-from rlservo.envs.ur.parameters import JOINTS
+from rlservo.robots.checks import ElementInfo
+from rlservo.robots.ur.parameters import JOINT_NAMES
 
 
 class EmptyEnvironmentURSim(URArmEnv):
@@ -72,10 +74,13 @@ class EmptyEnvironmentURSim(URArmEnv):
     ACTION_ELEMENT = ("position_normalized", "1")
 
     @classmethod
-    def _observation_elements(cls) -> list[tuple[str, str]]:
-        observation = [(f"{joint}_position_normalized", "1") for joint in JOINTS]
-        observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
-        return observation
+    def _observation_elements(cls) -> list[ElementInfo]:
+        observation = joint_elements(JOINT_NAMES, *cls.ACTION_ELEMENT, "joint position", LIMITS, np.zeros(6))
+        return observation + joint_elements(JOINT_NAMES, "velocity", "rad/s", "joint velocity")
+
+    @classmethod
+    def _position_map(cls, **_arguments: Any) -> tuple[Vector, Vector]:
+        return LIMITS, np.zeros(6)
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         high = np.concatenate([np.full(6, POSITION_BOUND), np.full(6, np.inf)])

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import InvalidResetError, as_vector
-from rlservo.envs.disturbances import Extreme, SensorError
+from rlservo.envs.elements import joint_elements, point_elements, polar_elements
 from rlservo.envs.rendering import Start
 from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, REDRAWS, Observation, URArmEnv, Vector, polar
-from rlservo.envs.ur.parameters import JOINTS
 from rlservo.envs.ur.sensor_errors import joint_errors, polar_errors, position_errors, velocity_errors
+from rlservo.robots.checks import ElementInfo, InvalidResetError, as_vector
+from rlservo.robots.disturbable import Extreme, SensorError
+from rlservo.robots.ur.parameters import JOINT_NAMES
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
 START_RANGE = (1.5, 0.25, 0.5, 1.0, 0.4, 3.14)  # [rad], +-, with randomize_start
@@ -82,9 +83,11 @@ class EndEffectorPositioningURSim(URArmEnv):
 
     `ur_model` (ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e), `fix_base` ... `fix_wrist_3`, `restrict_wrist_1`,
     `rs_state_to_info` (the robot server's `state_dict` in `info["rs_state"]`; False keeps info picklable for RLlib),
-    `render_mode`. Of our own: `randomize_start` (the default of the reset option), `max_velocity_scale_factor` (0.1)
-    and `action_cycle_rate` (10 Hz), which robo-gym has in its launch file. robo-gym's `ip`, `lower_bound_port`,
-    `upper_bound_port`, `gui` and `rs_address` are accepted and unused: there is no server to find.
+    `render_mode`. Of our own: `randomize_start` (the default of the reset option), `target` (the default of
+    `ee_target_pose`: 'base_link:X,Y,Z', 'base:X,Y,Z' in the pendant's frame, or 'joints:' and six), and
+    `max_velocity_scale_factor` (0.1) and `action_cycle_rate` (10 Hz), which robo-gym has in its launch file. robo-gym's
+    `ip`, `lower_bound_port`, `upper_bound_port`, `gui` and `rs_address` are accepted and unused: there is no server to
+    find.
 
     ## Differences from robo-gym on Gazebo
 
@@ -94,6 +97,7 @@ class EndEffectorPositioningURSim(URArmEnv):
     """
 
     START_JOINTS = START_JOINTS
+    WITHIN = SUCCESS_DISTANCE
     MAX_STEPS = 300
     RESET_OPTIONS = ("joint_positions", "ee_target_pose", "randomize_start", "continue_on_success")
     RS_MODE = "1object"
@@ -113,14 +117,20 @@ class EndEffectorPositioningURSim(URArmEnv):
         self._success_joints: Vector | None = None
 
     @classmethod
-    def _observation_elements(cls) -> list[tuple[str, str]]:
-        observation = [("target_r", "m"), ("target_theta", "rad"), ("target_phi", "rad")]
-        observation += [(f"{joint}_position_normalized", "1") for joint in JOINTS]
-        observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
-        observation += [(f"target_{axis}", "m") for axis in "xyz"]
-        observation += [(f"ee_{axis}", "m") for axis in "xyz"]
-        observation += [(f"{joint}_previous_action", "1") for joint in JOINTS]
-        return observation
+    def _observation_elements(cls) -> list[ElementInfo]:
+        observation = polar_elements("target", "tool0")
+        observation += joint_elements(JOINT_NAMES, *cls.ACTION_ELEMENT, "joint position", LIMITS, np.zeros(6))
+        observation += joint_elements(JOINT_NAMES, "velocity", "rad/s", "joint velocity")
+        observation += point_elements("target", "base_link") + point_elements("ee", "base_link")
+        return observation + joint_elements(JOINT_NAMES, "previous_action", "1", "last action")
+
+    @classmethod
+    def _position_map(cls, *, restrict_wrist_1: bool = True, **_arguments: Any) -> tuple[Vector, Vector]:
+        scale, offset = LIMITS.copy(), np.zeros(6)
+        if restrict_wrist_1:
+            low, high = WRIST_1_RANGE
+            scale[3], offset[3] = 0.5 * (high - low), 0.5 * (high + low)
+        return scale, offset
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         infinite = np.full(6, np.inf)
@@ -202,12 +212,12 @@ class EndEffectorPositioningURSim(URArmEnv):
         return self._place_arm_around(centre, START_RANGE)
 
     def _begin(self, options: Mapping[str, Any]) -> None:
+        del options
         self._previous_action = np.zeros(6)
-        pose = options.get("ee_target_pose")
-        self._target = self._random_target() if pose is None else as_vector("ee_target_pose", pose, 6)[:3]
+        self._target = self._target_pose()[:3]
         self.simulation.place_object(0, self._target)
 
-    def _random_target(self) -> Vector:
+    def _random_pose(self) -> Vector:
         arm = self.simulation.parameters
         while True:
             phi = self.np_random.uniform(0.0, 2.0 * math.pi)
@@ -215,7 +225,7 @@ class EndEffectorPositioningURSim(URArmEnv):
             radius = arm.workspace_radius * math.pow(self.np_random.uniform(0.0, 1.0), 1.0 / 3.0)
             horizontal = radius * math.sqrt(1.0 - cos_theta * cos_theta)
             if horizontal > arm.workspace_min_radius:
-                return np.array([horizontal * math.cos(phi), horizontal * math.sin(phi), radius * cos_theta])
+                return np.array([horizontal * math.cos(phi), horizontal * math.sin(phi), radius * cos_theta, 0, 0, 0])
 
     # -- a step
 
@@ -266,9 +276,10 @@ class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
     Observations, actions, rewards and endings are the simulated environment's, computed from the measured joints; a
     robot that stops ends the episode, with the reason as `final_status` (protective_stop, emergency_stop,
     program_stopped, connection_lost, stale_observation ...). A step lasts a control cycle of real time. `reset` moves
-    the arm slowly to its start, in a straight line of joint space, after asking at the terminal.
+    the arm slowly to its start, in a straight line of joint space, after asking at the terminal. A target that is drawn
+    is in front of the robot: within 45 degrees of base_link's x axis, and where the limits let the flange go.
 
-    It adds `limits` (names and defaults: `rlservo.envs.robots.limits.Limits`), `confirm` (False: `reset` does not ask),
+    It adds `limits` (names and defaults: `rlservo.robots.limits.Limits`), `confirm` (False: `reset` does not ask),
     `metrics` (HOST:PORT at which Prometheus reads state and limits), and `info["robot"]`: the state, its changes, and
     the limits that applied since the last step.
     """

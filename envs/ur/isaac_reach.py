@@ -13,11 +13,12 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rlservo.envs.checks import as_vector
-from rlservo.envs.disturbances import SensorError
+from rlservo.envs.elements import joint_elements, point_elements, quaternion_elements
 from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector
-from rlservo.envs.ur.parameters import JOINTS
 from rlservo.envs.ur.sensor_errors import JOINT_BIAS, JOINT_NOISE, velocity_errors
+from rlservo.robots.checks import ElementInfo, as_vector
+from rlservo.robots.disturbable import SensorError
+from rlservo.robots.ur.parameters import JOINT_NAMES, JOINTS
 
 DEFAULT_JOINTS = (0.0, -1.7120, 1.7120, 0.0, 0.0, 0.0)  # [rad], Isaac Lab's UR10
 ACTION_SCALE = 0.5  # [rad] of one unit of an action
@@ -78,13 +79,15 @@ class IsaacReachURSim(URArmEnv):
     ## Constructor
 
     `ur_model` (ur10), `fix_*` (none), `continue_except_collision` (True; False: each episode begins at the default
-    pose), `randomize_start`, `rs_state_to_info`, `render_mode`, `max_velocity_scale_factor` (0.2),
-    `action_cycle_rate` (30 Hz), and robo-gym's arguments for a server, as of `EndEffectorPositioningURSim`.
+    pose), `randomize_start`, `target`, `rs_state_to_info`, `render_mode`, `max_velocity_scale_factor`
+    (0.2), `action_cycle_rate` (30 Hz), and robo-gym's arguments for a server, as of `EndEffectorPositioningURSim`.
     """
 
     FIXED = ()
     TOOL = "tool1"
     START_JOINTS = DEFAULT_JOINTS
+    WITHIN = SUCCESS_DISTANCE
+    TARGET_TURN = (0.0, TARGET_PITCH, 0.0)
     MAX_STEPS = 600
     RESET_OPTIONS = ("joint_positions", "ee_target_pose", "randomize_start")
     RS_MODE = "1object"
@@ -114,11 +117,14 @@ class IsaacReachURSim(URArmEnv):
         self._end: Vector | None = None  # where an episode ended, if the next one may begin there
 
     @classmethod
-    def _observation_elements(cls) -> list[tuple[str, str]]:
-        observation = [(f"{joint}_position_offset", "rad") for joint in JOINTS]
-        observation += [(f"{joint}_velocity", "rad/s") for joint in JOINTS]
-        observation += [(f"target_{axis}", "m") for axis in "xyz"]
-        return observation + [(f"target_q{part}", "1") for part in "wxyz"]
+    def _observation_elements(cls) -> list[ElementInfo]:
+        observation = joint_elements(JOINT_NAMES, "position_offset", "rad", "joint position", [1.0] * 6, DEFAULT_JOINTS)
+        observation += joint_elements(JOINT_NAMES, "velocity", "rad/s", "joint velocity")
+        return observation + point_elements("target", "base_link") + quaternion_elements("target", "base_link", "wxyz")
+
+    @classmethod
+    def _position_map(cls, **_arguments: Any) -> tuple[Vector, Vector]:
+        return np.full(6, ACTION_SCALE), np.array(DEFAULT_JOINTS)
 
     def _observation_bounds(self) -> tuple[Vector, Vector]:
         low, high = (side[self._free] for side in self._action_bounds())
@@ -185,19 +191,18 @@ class IsaacReachURSim(URArmEnv):
         return self._place_arm_around(centre, START_RANGE)
 
     def _begin(self, options: Mapping[str, Any]) -> None:
+        del options
         self._command = np.zeros(6)
-        pose = options.get("ee_target_pose")
-        if pose is None:
-            position = self.np_random.uniform(TARGET_LOW, TARGET_HIGH)
-            roll, pitch, self._yaw = 0.0, TARGET_PITCH, float(self.np_random.uniform(-TARGET_YAW, TARGET_YAW))
-        else:
-            values = as_vector("ee_target_pose", pose, 6)
-            position = values[:3]
-            roll, pitch, self._yaw = values[3:].tolist()
-        self._target = position
+        pose = self._target_pose()
+        self._target = pose[:3]
+        roll, pitch, self._yaw = pose[3:].tolist()
         self._quaternion = quaternion_of(roll, pitch, self._yaw)
         self._target_rotation = rotation_of(self._quaternion)
         self.simulation.place_object(0, self._target)
+
+    def _random_pose(self) -> Vector:
+        position = self.np_random.uniform(TARGET_LOW, TARGET_HIGH)
+        return np.array([*position, 0.0, TARGET_PITCH, self.np_random.uniform(-TARGET_YAW, TARGET_YAW)])
 
     # -- a step
 

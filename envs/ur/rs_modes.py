@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rlservo.envs.ur.parameters import JOINTS
+from rlservo.robots.ur.parameters import JOINTS
 
 # Elbow, shoulder, base, wrists; the same list turns ROS order back into the standard one.
 ROS_ORDER = (2, 1, 0, 3, 4, 5)

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import math
 
-from rlservo.envs.disturbances import SensorError
-from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.robots.disturbable import SensorError
+from rlservo.robots.ur.parameters import JOINTS, POSITION_LIMITS
 
 REACH = 0.85  # [m], UR5
 REPEATABILITY = 1e-4  # [m]

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.envs.ur.rs_modes import ROS_ORDER, rs_mode_of, state_names
-from rlservo.envs.ur.simulation import ArmSimulation, URSimulation
+from rlservo.robots.ur.simulation import ArmSimulation, URSimulation
 
 Vector = NDArray[np.float64]
 Transform = tuple[float, float, float, float, float, float, float]  # x, y, z [m], quaternion x, y, z, w

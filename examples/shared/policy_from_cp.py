@@ -18,9 +18,9 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from rlservo import Policy, errors
+from rlservo.drive.make_environment import check_fit, make_env
+from rlservo.drive.success import success_of, success_rates
 from rlservo.export.sources.source import PICKLES
-from rlservo.serve_app.rollout.environment import check_fit, make_env
-from rlservo.serve_app.rollout.episode import success_of
 from shared.help_text import DefaultsFormatter
 
 Act = Callable[[Any, bool], tuple[NDArray[Any], bool]]
@@ -87,7 +87,7 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     from rlservo.export.checkpoints.location import locate_checkpoint
     from rlservo.export.checkpoints.unpickle import user_code
     from rlservo.export.recipe.recipe import leaf_transform
-    from rlservo.export.rllib.frozen_filter import why_untrained
+    from rlservo.export.rllib.mean_std_filter import why_untrained
     from rlservo.export.rllib.restore import restore
 
     files = locate_checkpoint(path, None)
@@ -129,7 +129,7 @@ def _space_name(space: Space[Any]) -> str:
 def run_episodes(env: Any, act: Act, episodes: int, seed: int) -> Count:
     """Run the episodes, a line for each, and print how many actions had to be clipped."""
     count = Count()
-    successes: list[bool] = []
+    outcomes: list[bool | None] = []
     for episode in range(episodes):
         obs, info = env.reset(seed=seed + episode)
         total, steps, is_over = 0.0, 0, False
@@ -139,8 +139,10 @@ def run_episodes(env: Any, act: Act, episodes: int, seed: int) -> Count:
             count.clipped += clipped
             obs, reward, terminated, truncated, info = env.step(action)
             total, steps, is_over = total + float(reward), steps + 1, terminated or truncated
-        successes.append(bool(success_of(info)))
+        outcomes.append(success_of(info))
         print(f"episode {episode}: return {total:.3f}, {steps} steps, {info.get('final_status', '')}", flush=True)
-    print(f"{sum(successes)} of {episodes} episodes succeeded")
+    (success,) = success_rates(outcomes)
+    rate = "no success rate" if success is None else f"{success.successes} of {episodes} episodes succeeded"
+    print(rate)
     print(f"clipped {count.clipped} of {count.actions} actions")
     return count

@@ -22,11 +22,11 @@ from ray.rllib.offline.offline_data import OfflineData
 from ray.rllib.utils import flatten_dict
 
 from rlservo import errors
-from rlservo.serve_app.learning.rllib_episodes import single_agent_episode, why_not_whole, why_without_reward
-from rlservo.serve_app.recording.conversion.common import episodes_of_one
-from rlservo.serve_app.recording.episodes import Episode
-from rlservo.serve_app.recording.own_actions import OwnActions, modes, own_actions
-from rlservo.serve_app.recording.reader import Recording
+from rlservo.deploy.learning.rllib_episodes import single_agent_episode, why_not_whole, why_without_reward
+from rlservo.recording.conversion.common import episodes_of_one
+from rlservo.recording.episodes import RecordedEpisode
+from rlservo.recording.reader import Recording
+from rlservo.recording.unsquashed_actions import OwnActions, modes, own_actions
 
 assert ray_settings
 AT_ONCE = 256  # episodes from which minibatches are drawn
@@ -56,7 +56,7 @@ class Recorded:
     def mean_return(self) -> float:
         return float(np.mean([episode.get_return() for episode in self.episodes]))
 
-    def add(self, episode: Episode, own: OwnActions, ahead: int) -> None:
+    def add(self, episode: RecordedEpisode, own: OwnActions, ahead: int) -> None:
         """Add an episode."""
         self.own += int(own.recorded.sum())
         self.inverted += int((~own.recorded).sum())
@@ -100,7 +100,7 @@ def read_recordings(recording: Recording, choice: Choice, *, name: str | None) -
     return recorded
 
 
-def _why_not(episode: Episode, own: OwnActions, choice: Choice) -> str | None:
+def _why_not(episode: RecordedEpisode, own: OwnActions, choice: Choice) -> str | None:
     if (reason := why_not_whole(episode)) is not None:
         return reason
     if choice.status is not None and episode.final_status != choice.status:

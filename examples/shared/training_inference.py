@@ -141,7 +141,7 @@ def algorithm_config(task: Task, args: argparse.Namespace, cpus: int, gpus: floa
     config.training(gamma=task.gamma)
     if args.run == "PPO":
         config.training(**task.training)
-    config.callbacks(on_episode_end=training_run.log_success, on_train_result=training_run.fill_return(RETURN, "max"))
+    config.callbacks(on_episode_end=training_run.SuccessLog(), on_train_result=training_run.fill_return(RETURN, "max"))
     config.debugging(seed=args.seed, log_level="ERROR")
     return config
 

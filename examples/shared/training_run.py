@@ -42,6 +42,7 @@ import shared.failures as failures
 import shared.resources as resources
 from rlservo import errors
 from rlservo.deploy.terminal import SAID_AFTER_S, status
+from rlservo.drive.success import success_of
 from shared.failures import metric
 
 assert ray_settings
@@ -54,6 +55,7 @@ _out = Console(soft_wrap=True, highlight=False)
 
 
 MILESTONE, MILESTONE_EPISODES = 0.95, 20  # the success rate whose time is printed, in an iteration with enough episodes
+SUCCESS_WINDOW = 100  # episodes of the success rate
 
 
 class InterruptError(Exception):
@@ -296,11 +298,22 @@ def pickle_by_value(*modules: ModuleType) -> None:
         cloudpickle.register_pickle_by_value(module)
 
 
-def log_success(*, episode: Any, metrics_logger: Any, **_: Any) -> None:
-    """RLlib's callback at an episode's end: the share of successes, if the environment reports it in `info`."""
-    info = episode.get_infos(-1) or {}
-    if "is_success" in info:
-        metrics_logger.log_value("success_rate", float(info["is_success"]), reduce="mean", window=100)
+@dataclass
+class SuccessLog:
+    """RLlib's callback at an episode's end: the share of successes, if the environment ever reports one in `info`."""
+
+    reports: bool = False
+    silent: int = 0  # episodes before the first report: failures as soon as there is one
+
+    def __call__(self, *, episode: Any, metrics_logger: Any, **_: Any) -> None:
+        outcome = success_of(episode.get_infos(-1) or {})
+        self.reports |= outcome is not None
+        if not self.reports:
+            self.silent = min(self.silent + 1, SUCCESS_WINDOW)
+            return
+        for succeeded in (*[False] * self.silent, bool(outcome)):
+            metrics_logger.log_value("success_rate", float(succeeded), reduce="mean", window=SUCCESS_WINDOW)
+        self.silent = 0
 
 
 def fill_return(metric: str, mode: str) -> Callable[..., None]:
@@ -659,7 +672,7 @@ def export_and_run(
 ) -> Path:
     """Export the checkpoint and run episodes with the bundle, which export has proven to act as RLlib does."""
     from rlservo import Policy, export_checkpoint, rollout
-    from rlservo.serve_app.rollout.report import render_report
+    from rlservo.drive.report import render_report
 
     with status("exporting") as show:
         bundle = export_checkpoint(checkpoint, out, app_dir=app_dir, notify=print, progress=show)

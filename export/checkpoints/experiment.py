@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from rlservo.errors import CheckpointError, UsageError
 from rlservo.export.checkpoints.facts import read_facts
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.errors import CheckpointError, UsageError
 
 RESULTS = "result.json"
 Pick = Literal["max", "min"]

@@ -14,11 +14,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rlservo.bundle.environment_id import plain_id
+from rlservo.errors import CheckpointError
 from rlservo.export.checkpoints.location import CTOR_FILE, FACTS_FILE
 from rlservo.export.checkpoints.old_location import ALGORITHM_STATE, POLICY_STATE, RLLIB_FILE, old_stack_root
 from rlservo.export.checkpoints.unpickle import unpickle
-from rlservo.export.contract.environment_id import plain_id
-from rlservo.export.contract.errors import CheckpointError
 
 # Path of RLlib's counter in algorithm_state.pkl: up to Ray 2.39, 2.40, and from 2.41 on.
 _STEPS = "num_env_steps_sampled_lifetime"

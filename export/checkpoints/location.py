@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
+from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.old_location import (
     DEFAULT_POLICY,
     OldStackFiles,
@@ -20,7 +21,7 @@ from rlservo.export.checkpoints.old_location import (
     policy_ids,
 )
 from rlservo.export.checkpoints.older_rays import OLD_WEIGHTS
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
+from rlservo.export.checkpoints.unpickle import modules_named
 
 MODULES = Path("learner_group") / "learner" / "rl_module"
 TRAINING_RUNNER, EVALUATION_RUNNER = "env_runner", "eval_env_runner"
@@ -29,6 +30,11 @@ MODULE_TO_ENV = "module_to_env_connector"
 CTOR_FILE = "class_and_ctor_args.pkl"
 STATE_STEMS = {"module": "module_state", "connector": "state"}
 STATE_SUFFIXES = (".pkl", ".msgpack", ".pt")
+LIBRARIES = (
+    "ray.rllib.", "rlservo.export.rllib.batched_connectors.", "gymnasium.", "numpy.", "torch.", "builtins.",
+    "collections.", "_codecs.",
+)  # fmt: skip
+"""Code of others in connector pipelines. What was pickled by value is made with cloudpickle's, which is not here."""
 FACTS_FILE = "rlservo_facts.json"
 """Written by `prune.py` in place of RLlib's own configuration pickles."""
 
@@ -106,9 +112,18 @@ class CheckpointFiles:
         early = weights_pickle(self.module).name == OLD_WEIGHTS
         if (early or not self.has_pipelines) and not self.alone:
             found.add(self.root / CTOR_FILE)  # the configuration they are built from
+        if self.has_own_connectors and (self.root / CTOR_FILE).is_file():
+            found.add(self.root / CTOR_FILE)  # RLlib often records their arguments wrongly, and restores by it
         if self.is_one_of_several and self.together.is_file():
             found.add(self.together)
         return sorted(found)
+
+    @property
+    def has_own_connectors(self) -> bool:
+        """Whether any code in the connector pipelines is the user's own."""
+        pickles = [folder / CTOR_FILE for folder in (self.env_to_module, self.module_to_env)]
+        named = {module for file in pickles if file.is_file() for module in modules_named(file)}
+        return not all(f"{module}.".startswith(LIBRARIES) for module in named)
 
     @property
     def together(self) -> Path:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
+from rlservo.errors import CheckpointError, UnsupportedError
 
 POLICIES = "policies"
 POLICY_STATE = "policy_state.pkl"

@@ -10,7 +10,7 @@ import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rlservo.export.contract.errors import UnsupportedError
+from rlservo.errors import UnsupportedError
 
 OLD_WEIGHTS = "module_state.pt"
 """The weights' file up to Ray 2.40. It is also a pickle."""

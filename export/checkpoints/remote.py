@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlservo.export.contract.errors import CheckpointError, RlservoError, UsageError, first_line
+from rlservo.errors import CheckpointError, RlservoError, UsageError, first_line
 
 if TYPE_CHECKING:
     from pyarrow.fs import FileSystem

@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import io
 import pickle
+import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
+from rlservo.errors import CheckpointError, UsageError, first_line
 from rlservo.export.checkpoints import older_rays
-from rlservo.export.contract.errors import CheckpointError, UsageError, first_line
 
 TRUNCATED = "the file is truncated or damaged ({})"
 
@@ -65,38 +66,46 @@ def _load(stream: BinaryIO, name: str, *, missing_ok: bool) -> Any:
         raise CheckpointError(f"{name} cannot be loaded: {reason}") from error
 
 
-def unpickle_plain(file: Path) -> Any:
-    """Return the numbers, texts and containers pickled in `file`; anything that needs code is a stand-in.
+def unpickle_present(file: Path) -> Any:
+    """Return the object pickled in `file`; code that cannot be imported raises when it is called.
 
     For a configuration that names modules which are not there. Raises CheckpointError when the file is damaged.
     """
     try:
         with file.open("rb") as stream:
-            return _PlainUnpickler(stream).load()
+            return _PresentUnpickler(stream).load()
     except Exception as error:  # a damaged pickle raises almost anything
         raise CheckpointError(f"{file} cannot be loaded: {explain(error)}") from error
 
 
-class _PlainUnpickler(pickle.Unpickler):
-    """Imports nothing."""
+def modules_named(file: Path) -> set[str]:
+    """Return the modules whose code a pickle names, without importing any; of a damaged one those before the damage."""
+    with file.open("rb") as stream:
+        unpickler = _NamesUnpickler(stream, missing_ok=False)
+        with suppress(Exception):
+            unpickler.load()
+    return unpickler.modules
 
-    def find_class(self, _module: str, _name: str) -> Any:
-        return _StandIn
 
-    def persistent_load(self, _pid: Any) -> Any:
-        return _StandIn()
+class _Missing:
+    """Stand-in for code that cannot be imported: a pickle may do anything with it, but nothing else may call it."""
 
+    error: ClassVar[Exception]
+    is_read: ClassVar[bool] = False
+    """Whether the pickle has been read to its end."""
 
-class _StandIn:
-    """Accepts and ignores everything that a pickle does to an object."""
-
-    def __new__(cls, *_args: Any, **_kwargs: Any) -> _StandIn:
+    def __new__(cls, *_args: Any, **_kwargs: Any) -> _Missing:
+        if cls.is_read:
+            raise cls.error
         return object.__new__(cls)
 
     def __init__(self, *_args: Any, **_kwargs: Any) -> None: ...
 
-    def __call__(self, *_args: Any, **_kwargs: Any) -> _StandIn:
-        return _StandIn()
+    def __call__(self, *_args: Any, **_kwargs: Any) -> _Missing:
+        return type(self)()
+
+    def __deepcopy__(self, _memo: Any) -> _Missing:
+        return self
 
     def __setitem__(self, _key: Any, _value: Any) -> None: ...
 
@@ -118,6 +127,39 @@ class _Unpickler(pickle.Unpickler):
         return older_rays.find_class(super().find_class, module, name, missing_ok=self._missing_ok)
 
 
+class _PresentUnpickler(_Unpickler):
+    """Puts a stand-in where code cannot be imported."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        super().__init__(stream, missing_ok=False)
+        self._missing: list[type[_Missing]] = []
+
+    def load(self) -> Any:
+        opened = super().load()
+        for kind in self._missing:
+            kind.is_read = True
+        return opened
+
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return super().find_class(module, name)
+        except Exception as error:  # a module of the user's own may raise anything when it is imported
+            self._missing.append(type(name, (_Missing,), {"error": error, "__module__": module}))
+            return self._missing[-1]
+
+
+class _NamesUnpickler(_Unpickler):
+    """Imports nothing."""
+
+    def __init__(self, stream: BinaryIO, *, missing_ok: bool) -> None:
+        super().__init__(stream, missing_ok=missing_ok)
+        self.modules: set[str] = set()
+
+    def find_class(self, module: str, name: str) -> Any:
+        self.modules.add(module)
+        return type(name, (_Missing,), {})
+
+
 def explain(error: BaseException) -> str:
     """Return in one clause why loading failed: the file, the code it names, or what that code raised."""
     if isinstance(error, ModuleNotFoundError) and error.name:
@@ -130,6 +172,10 @@ def explain(error: BaseException) -> str:
             f"its code does not fit what is installed ({first_line(error)}); looked in {searched()}, and --app-dir "
             "names another folder"
         )
+    if isinstance(error, pickle.UnpicklingError) and "weights_only" in str(error):  # torch advises to load it unsafely
+        code = re.search(r"GLOBAL (\S+)", str(error))
+        what = f"names the code '{code[1]}'" if code else "is damaged, or no file of torch.save"
+        return f"its weights are not tensors alone: the file {what}, and is not loaded"
     if isinstance(error, EOFError | pickle.UnpicklingError):
         return TRUNCATED.format(first_line(error))
     return first_line(error)

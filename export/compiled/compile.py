@@ -14,19 +14,21 @@ from typing import Any
 
 import numpy as np
 
+from rlservo.bundle.bundle import CONTRACT_FILE, ONNX_FILE, load_bundle
+from rlservo.errors import UsageError
 from rlservo.export.compiled.build_files import build_files
+from rlservo.export.compiled.c_source import write_source
 from rlservo.export.compiled.interface import header_text, interface_of
-from rlservo.export.compiled.proof import Proof, find_compiler, must_not_leave, prove
+from rlservo.export.compiled.moved_weights import MovedGraph
+from rlservo.export.compiled.proof import Proof, find_compiler, moved_inputs, must_not_leave, prove
 from rlservo.export.compiled.self_test import self_test_text
-from rlservo.export.compiled.source import write_source
 from rlservo.export.compiled.static_graph import read_static_graph
 from rlservo.export.compiled.tolerance import allowed_differences
-from rlservo.export.contract.bundle import CONTRACT_FILE, ONNX_FILE, load_bundle
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.runtime.compiled_policy import COMPILE_FILE, acting_contract
-from rlservo.serve_app.runtime.loading import open_graph
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.compiled_policy import COMPILE_FILE, acting_contract
+from rlservo.policy.loading import open_graph
+from rlservo.policy.policy import Policy
 
+MOVED = 4  # draws of the last bits, of which the largest movement counts: in one draw movements may cancel out
 NO_COMPILER = "no C compiler was found; run the self-test on a machine that has one"
 
 
@@ -57,8 +59,8 @@ def compile_bundle(
     """
     folder, chosen = Path(out), find_compiler(compiler)
     progress("reading the bundle")
-    Policy.load(path).close()  # every check that serving makes
     bundle = load_bundle(path)
+    Policy.load(bundle.path).close()  # every check that serving makes
     contract, (golden, recorded) = bundle.contract, bundle.golden()
     earlier = _earlier(folder, contract.name)
     ort_run: Callable[..., Sequence[Any]] = open_graph(bundle, 1).run
@@ -69,7 +71,10 @@ def compile_bundle(
     wanted = [tensor.name for tensor in acting_contract(contract).outputs]
     graph = read_static_graph(model, wanted, {tensor.name: golden[tensor.name][:1] for tensor in contract.inputs})
     source = write_source(face, contract, graph, weights_in_file=weights_in_file)
-    allowed, refused = allowed_differences(contract, recorded), must_not_leave(contract, recorded)
+    rng = np.random.default_rng(2)
+    moved_graphs = [MovedGraph(model, rng) for _ in range(MOVED)]
+    moved = [graph(moved_inputs(golden, rng)) for graph in moved_graphs]
+    allowed, refused = allowed_differences(contract, recorded, moved), must_not_leave(contract, recorded)
     texts = {
         f"{face.prefix}.c": source.text,
         f"{face.prefix}.h": header_text(face, contract, bundle.digest, source.scratch),
@@ -91,7 +96,7 @@ def compile_bundle(
             with np.errstate(over="ignore"):
                 proof = prove(
                     contract, chosen, beside, face.prefix, library,
-                    lambda feed: dict(zip(names, ort_run(names, dict(feed)), strict=True)), golden,
+                    lambda feed: dict(zip(names, ort_run(names, dict(feed)), strict=True)), moved_graphs, golden,
                 )  # fmt: skip
             (beside / f"{face.prefix}_test").unlink()
         about = {

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlservo.bundle.contract import REWARD, Contract
+from rlservo.bundle.spaces import BoxSpec, LeafSpec, leaf_specs
+from rlservo.errors import UnsupportedError
+from rlservo.export.compiled.c_program import c_type
 from rlservo.export.compiled.names import C_TYPES, Identifiers, comment, prefix_of, string
-from rlservo.export.compiled.program import c_type
-from rlservo.export.contract.contract import REWARD, Contract
-from rlservo.export.contract.errors import UnsupportedError
-from rlservo.export.contract.spaces import BoxSpec, LeafSpec, leaf_specs
 
 MAX_ELEMENTS = 1 << 24  # what a result code has room for
 KINDS = ("OK", "OUT_OF_BOUNDS", "NOT_FINITE", "NOT_A_CHOICE", "ACTION_NOT_FINITE", "ACTION_OUT_OF_SPACE")

@@ -1,6 +1,7 @@
 """C of a network's layers: dense, convolution, pooling, recurrent cells, matrix products.
 
-All but products of two computed matrices and pooling come down to one kernel, `dense`, whose weights are constants.
+Convolutions come down to the kernel `windows`, all else but pooling and products of two computed matrices to `dense`;
+their weights are constants.
 """
 
 from __future__ import annotations
@@ -11,28 +12,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rlservo.export.compiled.c_program import Program, Ref, broadcast, row_major
 from rlservo.export.compiled.names import number
-from rlservo.export.compiled.program import Program, Ref, broadcast, index, row_major
 from rlservo.export.compiled.static_graph import Node, refused
 
 BLOCKS = (32, 8)
 """Columns that `dense` computes at a time, as in kernels.c."""
+PLACES = 8
+"""Places of an output that `windows` computes at a time, as in kernels.c."""
 
 
 def dense(program: Program, source: Ref | str, weights: NDArray[Any], bias: NDArray[Any], result: Ref | str) -> None:
     """Emit `result = bias + source @ weights` for constant weights `[n, m]`."""
     program.kernels.add("dense")
     rows, columns = weights.shape
-    padded = np.zeros((rows + 1, columns + -columns % BLOCKS[-1]), np.float32)
+    numbers = program.constant(_blocks(weights, bias, BLOCKS), "weights")
+    program.emit(f"dense({source}, {numbers}, {result}, {rows}, {columns});")
+
+
+def _blocks(weights: NDArray[Any], bias: NDArray[Any], widths: Sequence[int]) -> NDArray[np.float32]:
+    """Return weights `[n, m]` as one stream of memory: a block of columns after the other, each its bias first."""
+    rows, columns = weights.shape
+    padded = np.zeros((rows + 1, columns + -columns % widths[-1]), np.float32)
     padded[:, :columns] = np.vstack([np.broadcast_to(bias, (1, columns)), weights])
-    blocks, begin = [], 0  # one stream of memory: each block of columns, its bias first
-    for width in BLOCKS:
+    blocks, begin = [], 0
+    for width in widths:
         while begin + width <= padded.shape[1]:
             blocks.append(padded[:, begin : begin + width].ravel())
             begin += width
-    program.emit(
-        f"dense({source}, {program.constant(np.concatenate(blocks), 'weights')}, {result}, {rows}, {columns});"
-    )
+    return np.concatenate(blocks)
 
 
 def _constants(program: Program, node: Node, names: Sequence[str]) -> list[NDArray[Any]]:
@@ -123,28 +131,32 @@ class _Windows:
 
 
 def _convolution(program: Program, node: Node) -> None:
-    """Each place of the output is a dense layer over the patch that it sees."""
+    """Places of the output, PLACES at a time: each a sum over the numbers that its window sees."""
     weights, bias = _constants(program, node, [*node.inputs[1:], ""][:2])
     _, inner, *kernel = weights.shape
     groups = int(node.attributes["group"])
-    outer, patch_size, windows = len(weights) // groups, int(np.prod([inner, *kernel])), _Windows(
-        program, node, kernel, "0")  # fmt: skip
+    outer, windows = len(weights) // groups, _Windows(program, node, kernel, "0")
     result, produced = program.new(node.outputs[0]), int(np.prod(windows.out))
-    patch, row = (program.temporary(np.float32, size) for size in (patch_size, outer))
+    program.kernels.add("windows")
+    seen = program.constant(_places([inner, *kernel], [windows.strides[0], *windows.within]), "seen")
+    places = _places(windows.out, windows.between)
+    begin = program.constant(np.pad(places, (0, -len(places) % PLACES), mode="edge"), "places")
     bias = np.broadcast_to(bias, len(weights))
     for group in range(groups):
         mine = slice(group * outer, (group + 1) * outer)
-        source = windows.source.at(group * inner * windows.strides[0])
-        for axis, size in enumerate(windows.out):
-            program.emit(f"for (int p{axis} = 0; p{axis} < {size}; p{axis}++)" + " {" * (axis == len(windows.out) - 1))
-        at = index(windows.between).replace("i", "p")
-        shape, strides = [inner, *kernel], [windows.strides[0], *windows.within]
-        there = Ref(source.dtype, f"{source} + {at}")
-        program.loop(shape, [(there, strides)], patch, row_major(shape), "{y} = {0};")
-        dense(program, patch, weights[mine].reshape(outer, -1).T, bias[mine], row)
-        place = index(row_major(windows.out)).replace("i", "p")
-        written = f"({result.at(group * outer * produced)})[{produced} * c + {place}]"
-        program.emit(f"for (int c = 0; c < {outer}; c++) {written} = ({row})[c];\n}}")
+        numbers = program.constant(_blocks(weights[mine].reshape(outer, -1).T, bias[mine], BLOCKS[-1:]), "weights")
+        source, target = windows.source.at(group * inner * windows.strides[0]), result.at(group * outer * produced)
+        sizes = f"{weights[0].size}, {outer}, {produced}, {produced} - p"
+        program.emit(
+            f"for (int p = 0; p < {produced}; p += {PLACES})\n"
+            f"    windows({source}, {begin} + p, {seen}, {numbers}, {target} + p, {sizes});"
+        )
+
+
+def _places(shape: Sequence[int], strides: Sequence[int]) -> NDArray[np.int32]:
+    """Return where each element of an array of `shape` lies in memory, in row-major order."""
+    offsets = [axis * stride for axis, stride in zip(np.indices(shape), strides, strict=True)]
+    return np.asarray(np.add.reduce(offsets, axis=0).ravel(), np.int32)
 
 
 def _pool(program: Program, node: Node) -> None:

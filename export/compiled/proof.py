@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.compiled.samples import ROWS, sample_inputs
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.spaces import leaf_specs
+from rlservo.errors import ActionError, ParityError, UsageError
+from rlservo.export.compiled.c_samples import ROWS, sample_inputs
+from rlservo.export.compiled.moved_weights import move_by_last_bit
 from rlservo.export.compiled.tolerance import allowed_differences
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import ActionError, ParityError, UsageError
-from rlservo.export.contract.spaces import leaf_specs
-from rlservo.serve_app.runtime.action_check import ActionCheck
-from rlservo.serve_app.runtime.compiled_policy import CompiledLibrary, acting_contract, is_refused
+from rlservo.policy.action_check import ActionCheck
+from rlservo.policy.compiled_policy import CompiledLibrary, acting_contract, is_refused
 
 STEPS = 100  # of ROWS observations
-MOVED = 4  # times that observations are moved by their last bit, if a difference is too large otherwise
 TIMES = ("median", "p99", "longest", "slowest_observation")
 COMPILERS = ("cc", "gcc", "clang")
 WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
@@ -48,7 +48,7 @@ class Proof:
     """Largest difference, as a share of the allowed one."""
     rounding_used: int
     """Observations that differ by more than the contract's tolerance, but no more than rounding explains: the largest
-    change of onnxruntime's own numbers in MOVED draws of the observation's last bit.
+    change of onnxruntime's own numbers in draws of the last bits of all weights and of the observation.
     """
     rounding_most: float
     """The largest of these differences, as a multiple of the contract's tolerance."""
@@ -104,9 +104,13 @@ def _compile(command: Sequence[str], folder: Path) -> None:
 
 
 def prove(
-    contract: Contract, compiler: str, folder: Path, prefix: str, library: str, compute: Compute, golden: Arrays
-) -> Proof:
-    """Compile what is in `folder` and compare it with the graph. Raises ParityError that names what differs."""
+    contract: Contract, compiler: str, folder: Path, prefix: str, library: str, compute: Compute,
+    moved_graphs: Sequence[Compute], golden: Arrays,
+) -> Proof:  # fmt: skip
+    """Compile what is in `folder` and compare it with the graph. Raises ParityError that names what differs.
+
+    `moved_graphs` are the graph with other last bits in its weights: they measure rounding.
+    """
     flags = build(compiler, folder, prefix, library)
     test = _run([f"./{prefix}_test"], folder)
     if test.returncode != 0:
@@ -123,7 +127,7 @@ def prove(
         stack_bytes=_stack(folder),
         state_bytes=loaded.state_size,
         code_bytes=(folder / library).stat().st_size,
-        **_compare_all(contract, loaded, compute, golden),
+        **_compare_all(contract, loaded, compute, moved_graphs, golden),
     )
 
 
@@ -136,12 +140,14 @@ def _stack(folder: Path) -> int | None:
             sizes[place.rsplit(":", 1)[-1]] = int(size)
         file.unlink()
     act = [size for name, size in sizes.items() if name.endswith("_act")]
-    deepest = max(sizes.get("dense", 0), sizes.get("tanh_of", 0) + sizes.get("sigmoid_of", 0) + max(
-        sizes.get("lstm", 0), sizes.get("gru", 0)))  # fmt: skip
+    cells = sizes.get("tanh_of", 0) + sizes.get("sigmoid_of", 0) + max(sizes.get("lstm", 0), sizes.get("gru", 0))
+    deepest = max(sizes.get("dense", 0), sizes.get("windows", 0), cells)
     return act[0] + deepest if act else None
 
 
-def _compare_all(contract: Contract, library: CompiledLibrary, compute: Compute, golden: Arrays) -> dict[str, Any]:
+def _compare_all(
+    contract: Contract, library: CompiledLibrary, compute: Compute, moved_graphs: Sequence[Compute], golden: Arrays
+) -> dict[str, Any]:
     """Return the figures of the comparison, as `Proof` names them."""
     rng = np.random.default_rng(1)
     initial = {f"state_in.{each.name}": each.initial_value(ROWS) for each in contract.state}
@@ -155,7 +161,7 @@ def _compare_all(contract: Contract, library: CompiledLibrary, compute: Compute,
         largest = np.max([share.max(axis=1, initial=0.0) for share in shares.values()], axis=0)
         beyond = (largest > 1.0) | (here != there)
         if beyond.any():
-            moved = [compute({**feed, **_moved(observed, rng)}) for _ in range(MOVED)]
+            moved = [graph({**feed, **moved_inputs(observed, rng)}) for graph in moved_graphs]
             unsure = np.any([there != must_not_leave(contract, each) for each in moved], axis=0)
             there = np.where(unsure, here, there)
             shares = _shares(contract, got, expected, here | there, moved)
@@ -227,12 +233,6 @@ def must_not_leave(contract: Contract, outputs: Arrays) -> NDArray[np.bool_]:
     return refused
 
 
-def _moved(observed: Arrays, rng: np.random.Generator) -> Arrays:
+def moved_inputs(observed: Arrays, rng: np.random.Generator) -> Arrays:
     """Return the observations with every floating-point number moved by its last bit in single precision."""
-    moved = {}
-    for name, array in observed.items():
-        towards = np.where(rng.random(array.shape) < 0.5, np.float32(np.inf), np.float32(-np.inf))
-        single = np.nextafter(array.astype(np.float32), towards) if array.dtype.kind == "f" else array
-        largest = np.finfo(np.float32).max
-        moved[name] = np.clip(single, -largest, largest).astype(array.dtype) if array.dtype.kind == "f" else array
-    return moved
+    return {name: move_by_last_bit(array, rng) for name, array in observed.items()}

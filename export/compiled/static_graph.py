@@ -17,8 +17,8 @@ import onnx
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
-from rlservo.export.contract.errors import UnsupportedError
-from rlservo.export.contract.ort_session import open_ort_session
+from rlservo.errors import UnsupportedError
+from rlservo.policy.ort_session import open_ort_session
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.scores import scores_name, split_scores
-from rlservo.export.contract.spaces import BoxSpec, leaf_specs
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.scores import scores_name, split_scores
+from rlservo.bundle.spaces import BoxSpec, leaf_specs
 
-ROUNDING = 8.0  # as export/proof/parity.py, which has the reasons
+ROUNDING = 8.0
+"""Multiple of the change by last bits that is rounding: enough for sums of 64 terms (reasons: `moved_weights`)."""
 MASKED = 1e30
+"""A number beyond this stands for 'not allowed'; it measures nothing."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -25,8 +27,8 @@ def allowed_differences(
 
     A float may differ by the contract's tolerance of its scale: half the range of a bounded action, else the largest
     number in its row. A choice must be equal, unless another one's score ties with its own, or scores are NaN: then it
-    may be any of those. `moved` is what the graph computes for observations moved by their last bit: 8 times that
-    change is also allowed.
+    may be any of those. `moved` is what the graph computes when the observation and all weights move by their last bit,
+    several times: ROUNDING times the largest change is also allowed.
     """
     rtol, atol = contract.parity.rtol, contract.parity.atol
     leaves = leaf_specs(contract.action_space, "action")

@@ -15,7 +15,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 from torch import Tensor, nn
 
-from rlservo.export.contract.contract import REWARD
+from rlservo.bundle.contract import REWARD
 from rlservo.export.recipe.recipe import (
     Flatten,
     FrameStack,
@@ -151,8 +151,9 @@ class FilterNode(ObservationNode):
     """RLlib's frozen MeanStdFilter, on an observation that is a single array.
 
     RLlib subtracts in double precision. With single-precision observations the same is reached by subtracting the mean
-    in two parts: the nearest float32, then the remainder (Dekker 1971), if it matters at all. Integers
-    are filtered in double precision and cut back to integers, as RLlib does it.
+    in two parts: the nearest float32, then the remainder (Dekker 1971), if it matters at all. Integers and
+    half-precision numbers are filtered in double precision. RLlib cuts integers back to integers; others, whose filter
+    does not keep them, give single precision.
     """
 
     offset: Tensor
@@ -164,8 +165,9 @@ class FilterNode(ObservationNode):
         super().__init__()
         self.clip = frozen.clip
         self.leaf = frozen.leaf
-        self.in_double = not dtype.is_floating_point
-        self.integer = dtype if self.in_double and frozen.keeps_integers else None
+        self.in_double = dtype not in (torch.float32, torch.float64)
+        kept = None if dtype.is_floating_point else dtype
+        self.result = kept if frozen.keeps_integers else torch.float32
         if self.in_double:
             dtype = torch.float64
         offset, scale = frozen.offset(), 1.0 / frozen.divisor().astype(np.float64)
@@ -189,7 +191,7 @@ class FilterNode(ObservationNode):
             obs = obs * self.scale
         if self.clip is not None:
             obs = torch.clamp(obs, -self.clip, self.clip)
-        return obs if self.integer is None else obs.to(self.integer)
+        return obs if self.result is None else as_dtype(obs, self.result)
 
 
 class FrameStackNode(ObservationNode):

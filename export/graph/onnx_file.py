@@ -22,12 +22,12 @@ import onnx
 import torch
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import UnsupportedError
-from rlservo.export.contract.ort_session import open_ort_session
+from rlservo.errors import UnsupportedError
 from rlservo.export.graph.operators import exact_operators
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.why_not_exportable import why_not_onnx
 from rlservo.export.recipe.runners import Inputs, Runner
+from rlservo.policy.ort_session import open_ort_session
 
 TORCHSCRIPT_OPSET = 17
 DYNAMO_OPSET = 18  # its lowest

@@ -69,7 +69,7 @@ def _sign(x: Tensor, like: Tensor) -> Tensor:
 
 
 def _tensor(x: Any, like: Tensor) -> Tensor:
-    return x if isinstance(x, Tensor) else torch.full_like(like, x)
+    return x if isinstance(x, Tensor) else torch.full_like(like, x, dtype=torch.result_type(like, x))
 
 
 # Angles, lengths, signs
@@ -135,6 +135,9 @@ def _cdist(a: Tensor, b: Tensor, p: float = 2.0, compute_mode: Any = None) -> Te
 def _remainder(a: Any, b: Any) -> Tensor:
     like = a if isinstance(a, Tensor) else b
     a, b = _tensor(a, like), _tensor(b, like)
+    if not torch.result_type(a, b).is_floating_point:
+        rest = torch.remainder(a, torch.abs(b))
+        return torch.where((rest != 0) & (b < 0), rest + b, rest)
     rest = torch.fmod(a, b)
     return torch.where((rest != 0) & ((rest < 0) != (b < 0)), rest + b, rest)
 
@@ -144,7 +147,7 @@ def _floor_divide(a: Any, b: Any) -> Tensor:
     like = a if isinstance(a, Tensor) else b
     a, b = _tensor(a, like), _tensor(b, like)
     if not torch.result_type(a, b).is_floating_point:
-        return torch.div(a - torch.remainder(a, b), b, rounding_mode="trunc")
+        return _integer_quotient(a - _remainder(a, b), b)
     rest = torch.fmod(a, b)
     quotient = (a - rest) / b
     quotient = torch.where((rest != 0) & ((rest < 0) != (b < 0)), quotient - 1.0, quotient)
@@ -154,11 +157,18 @@ def _floor_divide(a: Any, b: Any) -> Tensor:
     return torch.where(b != 0, _copysign(whole, ratio), ratio)
 
 
+def _integer_quotient(a: Tensor, b: Tensor) -> Tensor:
+    """Divide by the divisor's size: the smallest integer by -1 ends onnxruntime's process."""
+    quotient = torch.div(a, torch.abs(b), rounding_mode="trunc")
+    return torch.where(b < 0, -quotient, quotient)
+
+
 def _div(a: Any, b: Any, *, rounding_mode: str | None = None) -> Tensor:
     if rounding_mode == "floor":
         return _floor_divide(a, b)
-    if rounding_mode == "trunc" and torch.result_type(a, b).is_floating_point:
-        return _trunc(torch.div(a, b))
+    if rounding_mode == "trunc":
+        is_real = torch.result_type(a, b).is_floating_point
+        return _trunc(torch.div(a, b)) if is_real else _integer_quotient(a, _tensor(b, a))
     return torch.div(a, b, rounding_mode=rounding_mode)
 
 
@@ -399,5 +409,5 @@ EXACT: dict[str, Callable[..., Any]] = {
 }
 """The compositions by the name of torch's function, for tensors of real numbers, with its arguments."""
 
-OF_INTEGERS_TOO = frozenset({"floor_divide", "__floordiv__", "__rfloordiv__", "div", "divide"})
-"""For integers the TorchScript-based exporter turns -1 // 7 into 0."""
+OF_INTEGERS_TOO = frozenset({"floor_divide", "__floordiv__", "__rfloordiv__", "div", "divide", "remainder", "__rmod__"})
+"""For integers the TorchScript-based exporter turns -1 // 7 into 0, and a divisor of -1 can end the process."""

@@ -17,7 +17,7 @@ from gymnasium.spaces import Box, MultiDiscrete
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rlservo.export.contract.contract import REWARD
+from rlservo.bundle.contract import REWARD
 from rlservo.export.graph.observation_nodes import ObservationNode, as_dtype, observation_nodes
 from rlservo.export.recipe.recipe import Affine, Recipe, leaf_transform, parameter_count
 from rlservo.export.recipe.trees import Tree, build, map_tree, named_leaves

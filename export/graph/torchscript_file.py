@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import UnsupportedError, first_line
+from rlservo.errors import UnsupportedError, first_line
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.why_not_exportable import frozen_by_tracing, raised_at, tracer_warning
 from rlservo.export.recipe.runners import Inputs, Runner

@@ -13,10 +13,10 @@ from typing import Any
 
 import torch
 
-from rlservo.export.contract.errors import first_line
+from rlservo.errors import first_line
+from rlservo.export.recipe.kept_values import INSTALLED
 from rlservo.export.recipe.runners import Inputs
 
-INSTALLED = ("site-packages", "dist-packages")
 INSTEAD = {
     "cummax|cummin": "take torch.maximum or torch.minimum of one column after the other and torch.stack them",
     r"complex|polar|real|imag|view_as_\w+|fft_\w+": "keep real and imaginary parts as two tensors (torch.hypot and "

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiDiscrete
 
-from rlservo.export.contract.contract import BakedStep
+from rlservo.bundle.contract import BakedStep
 from rlservo.export.recipe.recipe import (
     Flatten,
     FrameStack,

@@ -267,11 +267,11 @@ def leaf_transform(space: Any, transform: Transform) -> Transform:
     return transform
 
 
-def loose_bounds(recipe: Recipe) -> list[str]:
-    """Return a sentence for each action leaf whose bounds RLlib does not enforce."""
+def loose_bounds(recipe: Recipe, framework: str) -> list[str]:
+    """Return a sentence for each action leaf whose bounds the framework does not enforce."""
     return [
-        f"{name}: RLlib sends the network's own numbers to env.step, whether inside {space} or not, and so does the "
-        "graph; rlservo's runtime refuses an action outside"
+        f"{name}: {framework} sends the network's own numbers, whether inside {space} or not, and so does the graph; "
+        "rlservo's runtime refuses an action outside"
         for name, space in recipe.action_leaves.items()
         if isinstance(space, Box)
         and bool((space.bounded_below | space.bounded_above).any())

@@ -1,14 +1,14 @@
 """Sample observations for the proof: likely ones, wide ones, and extremes.
 
 They stay within bounds (`out_of_bounds` decides about others), except where a filter comes first, whose clip must show.
-A policy with a state is given sequences in which episodes end and begin at different steps in different rows. The
-numbers come from a recipe's observation space and filter.
+Sequences, in which episodes end and begin at different steps in different rows, show a state, or that there is none.
+The numbers come from a recipe's observation space and filter.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 from numpy.typing import NDArray
 
+from rlservo.bundle.contract import REWARD
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe
 from rlservo.export.recipe.runners import Inputs
 
@@ -25,7 +26,12 @@ WIDE = 10.0  # standard deviations
 EXTREME = 1e3
 SEQUENCE_STEPS = {1: 12, 2: 100, 257: 5}  # a step costs the framework milliseconds, a row of it a tenth of one
 LARGE = 4096  # elements of an observation: such a network takes 0.1 s for a step, and TorchScript as much again
-LARGE_SEQUENCE_STEPS = {1: 12, 2: 16, 257: 2}
+LARGE_SEQUENCE_STEPS = {1: 12, 2: 24, 257: 2}
+CANDIDATES, LARGE_CANDIDATES = 8192, 192
+CANDIDATE_STEPS = 16
+"""Observations among which an action's extremes are looked for; steps of their sequences, if there is a state."""
+STATELESS_STEPS = 32
+"""Steps of the sequence for a policy without a state."""
 RESTARTS = (0, 7, 8)  # steps at which every row begins an episode; the first row's last one has no other end
 NEW_EPISODE = 0.05  # probability that another row begins one at any other step
 
@@ -35,12 +41,13 @@ class Batch:
     """Observations by input name in the space's dtypes, and their kind.
 
     In a sequence, `restart` marks the rows that begin an episode; the other rows continue from the batch before. None:
-    the batch stands alone.
+    the batch stands alone. `reward` is the last action's reward, of a policy that has no input for it.
     """
 
     kind: str
     inputs: Inputs
     restart: NDArray[np.bool_] | None = None
+    reward: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.inputs.values())))
@@ -51,18 +58,50 @@ class Batch:
         (only,) = self.inputs.values()
         return only
 
+    def row(self, index: int) -> Batch:
+        """Return one row as a batch of its own."""
+        one = slice(index, index + 1)
+        return Batch(
+            self.kind,
+            {name: values[one] for name, values in self.inputs.items()},
+            None if self.restart is None else self.restart[one],
+            None if self.reward is None else self.reward[one],
+        )
+
 
 def draw_batches(recipe: Recipe, seed: int) -> list[Batch]:
-    """Return batches of every kind and every size in BATCH_SIZES; the same seed draws the same.
+    """Return batches of every kind and every size in BATCH_SIZES, then a sequence; the same seed draws the same.
 
-    For a policy with a state they are sequences of SEQUENCE_STEPS batches of one size; of images, shorter ones.
+    For a policy with a state all are sequences of SEQUENCE_STEPS batches of one size; of images, shorter ones.
     """
     rng = np.random.default_rng(seed)
     if recipe.state:
-        return [batch for size in BATCH_SIZES for batch in _sequence(recipe, rng, size)]
+        return [
+            batch for size in BATCH_SIZES for batch in _sequence(recipe, rng, size, _kinds(rng, _steps(recipe, size)))
+        ]
     one, two, many = BATCH_SIZES
     sizes = [many, *[one] * 4, *[two] * 2]
-    return [Batch(kind, _observations(recipe, kind, rng, size)) for kind in KINDS for size in sizes]
+    batches = [Batch(kind, _observations(recipe, kind, rng, size)) for kind in KINDS for size in sizes]
+    return [*batches, *_sequence(recipe, rng, two, _kinds(rng, STATELESS_STEPS))]
+
+
+def _steps(recipe: Recipe, size: int) -> int:
+    return (SEQUENCE_STEPS if _elements(recipe) <= LARGE else LARGE_SEQUENCE_STEPS)[size]
+
+
+def _elements(recipe: Recipe) -> int:
+    return sum(math.prod(leaf.shape) for leaf in recipe.observation_leaves.values())
+
+
+def draw_candidates(recipe: Recipe, seed: int) -> list[Batch]:
+    """Return one batch of many observations of every kind; for a policy with a state a sequence of many rows."""
+    rng = np.random.default_rng(seed)
+    count = CANDIDATES if _elements(recipe) <= LARGE else LARGE_CANDIDATES
+    if recipe.state:
+        order = rng.permutation([*DRAWS] * (CANDIDATE_STEPS // len(DRAWS)))
+        return list(_sequence(recipe, rng, count // CANDIDATE_STEPS, order.tolist()))
+    kinds = [_observations(recipe, kind, rng, count // len(DRAWS)) for kind in DRAWS]
+    return [Batch("reaching", {name: np.concatenate([kind[name] for kind in kinds]) for name in kinds[0]})]
 
 
 def draw_pair(recipe: Recipe) -> Inputs:
@@ -70,20 +109,22 @@ def draw_pair(recipe: Recipe) -> Inputs:
     return _observations(recipe, "likely", np.random.default_rng(0), 2)
 
 
-def _sequence(recipe: Recipe, rng: np.random.Generator, size: int) -> Iterator[Batch]:
-    elements = sum(math.prod(leaf.shape) for leaf in recipe.observation_leaves.values())
-    steps = (SEQUENCE_STEPS if elements <= LARGE else LARGE_SEQUENCE_STEPS)[size]
+def _kinds(rng: np.random.Generator, steps: int) -> list[str]:
     rare = (steps + 5) // 10
-    kinds = rng.permutation(["wide"] * rare + ["extreme"] * rare + ["likely"] * (steps - 2 * rare))
-    for step, kind in enumerate(kinds.tolist()):
+    kinds: list[str] = rng.permutation(["wide"] * rare + ["extreme"] * rare + ["likely"] * (steps - 2 * rare)).tolist()
+    return kinds
+
+
+def _sequence(recipe: Recipe, rng: np.random.Generator, size: int, kinds: Sequence[str]) -> Iterator[Batch]:
+    for step, kind in enumerate(kinds):
         inputs = _observations(recipe, kind, rng, size)
         restart = (rng.random(size) < NEW_EPISODE) & (np.arange(size) > 0)
         if step in RESTARTS:
             restart[:] = True
+        reward = np.where(restart, 0.0, rng.standard_normal(size)).astype(np.float32)
         if recipe.needs_reward:
-            rewards = rng.standard_normal(size).astype(np.float32)
-            inputs["reward"] = np.where(restart, np.float32(0.0), rewards)
-        yield Batch(kind, inputs, restart)
+            inputs[REWARD] = reward
+        yield Batch(kind, inputs, restart, None if recipe.needs_reward else reward)
 
 
 def _observations(recipe: Recipe, kind: str, rng: np.random.Generator, size: int) -> Inputs:
@@ -115,7 +156,8 @@ def _draw(kind: str, leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArra
         return _integers(kind, space, rng, size)
     if np.dtype(space.dtype).kind == "b":
         return np.asarray(rng.random((size, *space.shape)) < 0.5)
-    return KINDS[kind](leaf, rng, size).astype(space.dtype)
+    largest = float(np.finfo(space.dtype).max)  # float16's is 65504
+    return np.clip(DRAWS[kind](leaf, rng, size), -largest, largest).astype(space.dtype)
 
 
 def _integers(kind: str, space: Box, rng: np.random.Generator, size: int) -> NDArray[Any]:
@@ -158,11 +200,22 @@ def _extreme(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.flo
     return _within(leaf, np.where(rows, spoiled, corner))
 
 
-KINDS: dict[str, Callable[[_Leaf, np.random.Generator, int], NDArray[np.float64]]] = {
+def _of_any_size(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    """Normal about the centre, each row of another size, from a hundredth to a thousand standard deviations."""
+    centre, spread = _centre_and_spread(leaf)
+    sizes = 10.0 ** rng.uniform(-2.0, 3.0, (size, *[1] * centre.ndim))
+    drawn = centre + sizes * spread * rng.standard_normal((size, *centre.shape))
+    return drawn if leaf.filtered_first else _within(leaf, drawn)
+
+
+DRAWS: dict[str, Callable[[_Leaf, np.random.Generator, int], NDArray[np.float64]]] = {
     "likely": _likely,
     "wide": _wide,
     "extreme": _extreme,
+    "of any size": _of_any_size,
 }
+KINDS = ("likely", "wide", "extreme")
+"""Kinds of the samples that every export is proven on."""
 
 
 def _bounds(leaf: _Leaf) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:

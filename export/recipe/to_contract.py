@@ -9,8 +9,8 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from numpy.typing import NDArray
 
-from rlservo.export.contract.contract import StateSpec
-from rlservo.export.contract.spaces import (
+from rlservo.bundle.contract import StateSpec
+from rlservo.bundle.spaces import (
     BoxSpec,
     DictSpec,
     DiscreteSpec,

@@ -1,7 +1,8 @@
 """Nested observations, actions and states as named leaves: `obs`, or `obs.<path>` for Dict and Tuple spaces.
 
-A tree is a leaf, a dict of trees or a tuple of trees. Dict keys come in sorted order, as dm-tree has them and RLlib
-therefore flattens them, whatever order the space was written in.
+A tree is a leaf, a dict of trees or a tuple of trees. Leaves are listed in sorted order of their keys, as dm-tree has
+them and RLlib therefore flattens them, whatever order the space was written in. A tree's own dicts keep the space's
+order, in which Gymnasium's vector environments give them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any, TypeAlias
 
 from gymnasium import spaces
 
-from rlservo.export.contract.errors import UnsupportedError
+from rlservo.errors import UnsupportedError
 
 Tree: TypeAlias = Any
 """A leaf, a dict of trees or a tuple of trees."""
@@ -76,6 +77,18 @@ def build(space: Any, leaves: Sequence[Any]) -> Tree:
     return tree
 
 
+def build_in_order(space: Any, named: Mapping[str, Any], name: str = "obs") -> Tree:
+    """Return the tree of `space` with the leaves `named`, in whose order the keys of its dicts come."""
+    inside = children(space)
+    if inside is None:
+        return named[name]
+    places = {path: place for place, path in enumerate(named)}
+    first = {key: min((places[path] for path in space_leaves(child, f"{name}.{key}")), default=0)
+             for key, child in inside.items()}  # fmt: skip
+    built = {key: build_in_order(inside[key], named, f"{name}.{key}") for key in sorted(first, key=first.__getitem__)}
+    return built if isinstance(space, spaces.Dict) else tuple(built[index] for index in inside)
+
+
 def build_like(tree: Tree, leaves: Sequence[Any]) -> Tree:
     """Return a tree of the shape of `tree` with other leaves."""
     rest = list(leaves)
@@ -85,7 +98,7 @@ def build_like(tree: Tree, leaves: Sequence[Any]) -> Tree:
 def map_tree(function: Callable[[Any], Any], tree: Tree) -> Tree:
     """Return the tree with `function` applied to every leaf; dicts and tuples are new ones."""
     if isinstance(tree, Mapping):
-        return {key: map_tree(function, tree[key]) for key in sorted(tree)}
+        return {key: map_tree(function, child) for key, child in tree.items()}
     if isinstance(tree, tuple):
         return tuple(map_tree(function, child) for child in tree)
     return function(tree)
@@ -96,12 +109,13 @@ def _take(space: Any, rest: list[Any]) -> Tree:
     if inside is None:
         return rest.pop(0)
     built = {key: _take(child, rest) for key, child in inside.items()}
-    return built if isinstance(space, spaces.Dict) else tuple(built.values())
+    return {key: built[key] for key in space.spaces} if isinstance(space, spaces.Dict) else tuple(built.values())
 
 
 def _take_like(tree: Tree, rest: list[Any]) -> Tree:
     if isinstance(tree, Mapping):
-        return {key: _take_like(tree[key], rest) for key in sorted(tree)}
+        built = {key: _take_like(tree[key], rest) for key in sorted(tree)}
+        return {key: built[key] for key in tree}
     if isinstance(tree, tuple):
         return tuple(_take_like(child, rest) for child in tree)
     return rest.pop(0)

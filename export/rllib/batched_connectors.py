@@ -34,7 +34,7 @@ from ray.rllib.utils.filter import RunningStat
 from ray.rllib.utils.numpy import SMALL_NUMBER, convert_to_numpy
 from ray.rllib.utils.spaces.space_utils import clip_action, unsquash_action
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 
 SUMS = ("mean_array", "sum_sq_diff_array")  # of a running filter
 

@@ -13,7 +13,7 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor
 
-from rlservo.export.contract.errors import UnsupportedError, first_line
+from rlservo.errors import UnsupportedError, first_line
 from rlservo.export.recipe.recipe import DistributionKind, Mode, parameter_count
 from rlservo.export.recipe.trees import Tree, space_leaves, tree_leaves
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from rlservo.export.contract.errors import UnsupportedError
+from rlservo.errors import UnsupportedError
 
 KNOWN = "2.60"
 """The Ray these names are of."""

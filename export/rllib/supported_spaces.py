@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
 
-from rlservo.export.contract.errors import UnsupportedError
+from rlservo.errors import UnsupportedError
 from rlservo.export.recipe.recipe import Flatten, ObservationStep, Preprocess, Transform, leaf_transform
 from rlservo.export.recipe.trees import space_leaves
 

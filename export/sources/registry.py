@@ -6,17 +6,18 @@ import pkgutil
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from rlservo.export.contract.errors import CheckpointError, UsageError, first_line
+from rlservo.errors import CheckpointError, UsageError, first_line
 from rlservo.export.sources.source import Notify, Source
 
 ENTRY_POINTS = "rlservo.sources"
 OURS = (
-    "rlservo.export.rllib.source:NewStack",
-    "rlservo.export.rllib.source:OldStack",
+    "rlservo.export.rllib.rllib_source:NewStack",
+    "rlservo.export.rllib.rllib_source:OldStack",
     "rlservo.export.sources.sb3:StableBaselines3",
     "rlservo.export.sources.rsl_rl:RslRl",
     "rlservo.export.sources.skrl:Skrl",
     "rlservo.export.sources.leapp:Leapp",
+    "rlservo.export.sources.onnx.onnx_source:GivenOnnx",
 )
 """Their modules import no framework. The first one is used if a path does not exist."""
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeAlias
 import torch
 from torch import Tensor, nn
 
-from rlservo.export.contract.spaces import Element
+from rlservo.bundle.spaces import Element
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.recipe.runners import Loop
 from rlservo.export.recipe.trees import Tree
@@ -65,3 +65,5 @@ class RestoredPolicy:
     """Names of its elements in the checkpoint; None if the environment's class has them."""
     untrained_filter: str = ""
     """Reason why the observation filter's statistics are not training's; '' if they are or there is no filter."""
+    reference: str = ""
+    """What `start_loop` starts, if it is not what the source's own `reference` says."""

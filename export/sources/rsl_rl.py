@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import yaml
 from gymnasium.spaces import Box
 
+from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.facts import CheckpointFacts
 from rlservo.export.checkpoints.unpickle import explain
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe, StateLeaf
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source, one_policy
 
@@ -37,16 +42,17 @@ class RslRl(Source):
     packages = ("rsl_rl", "tensordict")
     expects = "rsl_rl's model_*.pt with params/agent.yaml beside it, or that folder"
     reference = (
-        "rsl_rl's own actor, the module that runner.get_inference_policy() returns, with its normalizer and memory; "
-        "then the scale and offset of the environment's action terms"
+        "the policy of rsl_rl's own runner, restored by runner.load: get_inference_policy() with its normalizer and "
+        "memory; then process_actions of the environment's action terms, as Isaac Lab computes it"
     )
+    options = ("--joint-order",)
 
     def detects(self, path: Path) -> bool:
         model = newest_model(path)
         agent = _agent_file(model) if model else None
         # skrl's agent.yaml has other parts.
         return agent is not None and bool(
-            re.search(r"^(actor|student|policy):", agent.read_text("utf-8"), re.MULTILINE)
+            re.search(r"^(actor|student|policy):", agent.read_text("utf-8", errors="replace"), re.MULTILINE)
         )
 
     def locate(self, path: Path, module_id: str | None, agent_id: str | None) -> PolicyFiles:
@@ -55,23 +61,21 @@ class RslRl(Source):
         agent = _agent_file(model) if model else None
         if model is None or agent is None:
             raise CheckpointError(f"{given} is not a run of rsl_rl: expected {self.expects}")
-        environment = agent.with_name(ENVIRONMENT.name)
-        files = [model, agent, *([environment] if environment.is_file() else [])]
-        return one_policy(model, files, module_id, agent_id)
+        return one_policy(model, [model, agent, *environment_files(agent)], module_id, agent_id)
 
     def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002
         return ""  # torch.load(weights_only=True) and plain YAML
 
     def facts(self, files: PolicyFiles, notify: Notify) -> CheckpointFacts:  # noqa: ARG002
-        from rlservo.export.sources.isaac_env import read_yaml
+        from rlservo.export.sources.isaac_env import read_yaml, section
 
-        agent = read_yaml(_agent_file(files.root) or files.root)
-        algorithm = (agent.get("algorithm") or {}).get("class_name") or "unknown"
+        agent_file = _agent_file(files.root) or files.root
+        algorithm = section(read_yaml(agent_file), "algorithm", agent_file).get("class_name") or "unknown"
         match = _MODEL.fullmatch(files.root.name)
         return CheckpointFacts(str(algorithm), training_iterations=int(match[1]) if match else None)
 
-    def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:  # noqa: ARG002
-        return _restore(files.root, notify)
+    def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:
+        return _restore(files.root, options.joint_order, notify)
 
 
 def newest_model(path: Path) -> Path | None:
@@ -80,6 +84,14 @@ def newest_model(path: Path) -> Path | None:
         return path if path.suffix == ".pt" else None
     numbered = [(int(match[1]), file) for file in path.glob("model_*.pt") if (match := _MODEL.fullmatch(file.name))]
     return max(numbered)[1] if numbered else None
+
+
+def environment_files(agent: Path) -> list[Path]:
+    """Return the files beside `agent` that describe the environment."""
+    from rlservo.export.sources.isaac_env import DESCRIPTORS
+
+    files = (agent.with_name(ENVIRONMENT.name), agent.parent.parent / DESCRIPTORS)
+    return [file for file in files if file.is_file()]
 
 
 def _agent_file(model: Path) -> Path | None:
@@ -92,50 +104,56 @@ def load_weights(file: Path) -> dict[str, Any]:
     import torch
 
     try:
-        loaded = torch.load(file, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a pickle's version
+            loaded = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # damaged archives and forbidden classes raise several unrelated types
-        raise CheckpointError(f"{file} cannot be read as weights alone: {explain(error)}") from error
+        raise CheckpointError(f"{file} cannot be read as weights alone: {_why_not_weights(error)}") from error
     if not isinstance(loaded, dict):
         raise CheckpointError(f"{file} holds a {type(loaded).__name__}: expected a dictionary of weights")
     return loaded
 
 
-def _restore(file: Path, notify: Notify) -> RestoredPolicy:
-    from rlservo.export.sources.isaac_env import ActionTerms, action_terms, read_yaml
+def _why_not_weights(error: Exception) -> str:
+    """Return a reason in our own words: torch's advice is to load the file unsafely."""
+    words = str(error)
+    if "TorchScript" in words:
+        return "it is a TorchScript module: expected what the trainer saved"
+    if "Weights only load failed" in words or "weights_only" in words:
+        named = re.search(r"GLOBAL ([\w.]+)", words)
+        what = f"the Python class {named[1]}" if named else "Python objects"
+        return f"it is a pickle with {what} in it, which would run code when loaded: save tensors and numbers only"
+    return explain(error) if words.strip() else "it is empty or damaged"
+
+
+def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> RestoredPolicy:
+    from rlservo.export.sources.isaac_env import action_terms, read_yaml
+    from rlservo.export.sources.isaac_observations import observation_elements
     from rlservo.export.sources.restored_policy import ElementNames
     from rlservo.export.sources.torch_policy import TorchPolicy, restored
 
     agent_file = _agent_file(file)
     assert agent_file is not None, "locate has found it"
     agent, weights = read_yaml(agent_file), load_weights(file)
-    part = next((part for part, key in ACTORS.items() if key in weights), None)
-    if part is None or part not in agent:
-        raise UnsupportedError(
-            f"{file}: expected the weights and settings of an actor as rsl_rl 5 writes them (actor_state_dict, and "
-            f"'actor' in {agent_file}), got {', '.join(sorted(weights)[:4])}: continue a run of an older rsl_rl with "
-            "rsl_rl 5 first, or export its network with rlservo.export_policy"
-        )
-    state_dict = weights[ACTORS[part]]
-    actor, acting = (_actor(file, agent, part, state_dict) for _ in range(2))
-    groups = (agent.get("obs_groups") or {}).get(part) or ["policy"]
+    part, state_dict = _acting_part(file, agent_file, agent, weights)
+    actor = _actor(file, agent, part, state_dict)
+    size = actor.distribution.output_dim if actor.distribution is not None else state_dict[_last(state_dict)].shape[0]
+    environment = file.parent / ENVIRONMENT
+    terms = action_terms(environment, size, _clip_actions(agent_file, agent), joint_order)
+    groups = _groups(agent_file, agent, part)
     if len(groups) > 1:
         notify(f"an observation concatenates the groups {', '.join(groups)}, in this order")
-    size = acting.distribution.output_dim if acting.distribution is not None else state_dict[_last(state_dict)].shape[0]
-    environment = file.parent / ENVIRONMENT
-    limit = agent.get("clip_actions")
-    terms = ActionTerms(notes=("no params/env.yaml: the export gives the policy's own numbers, unscaled",))
-    if environment.is_file():
-        terms = action_terms(read_yaml(environment), size, float(limit) if limit is not None else None)
     for note in terms.notes:
         notify(note)
     frozen = _filter(file, actor)
     memory = _memory(actor)
+    low, high = terms.bounds or (-np.inf, np.inf)
     recipe = Recipe(
         Box(-np.inf, np.inf, (actor.obs_dim,), np.float32),
-        Box(-np.inf, np.inf, (size,), np.float32),
+        Box(low, high, (size,), np.float32),
         (frozen,) if frozen else (),
         "given",
-        "none",
+        "clip" if terms.bounds else "none",
         None,
         memory,
         affine=terms.affine,
@@ -148,9 +166,55 @@ def _restore(file: Path, notify: Notify) -> RestoredPolicy:
     untrained = (
         f"the normalizer's statistics come from {frozen.count} observations" if frozen and not frozen.count else ""
     )
-    policy = TorchPolicy(recipe, exported, _traced(len(memory)), lambda: _Reference(acting))
-    elements = ElementNames((), terms.elements, terms.control_rate_hz)
-    return restored(policy, elements, str(file), f"{type(acting).__module__}.{type(acting).__qualname__}", untrained)
+    reference = _RslRlReference(
+        file, part, (actor.obs_dim, size), environment if terms.processed else None, joint_order
+    )
+    policy = TorchPolicy(recipe, exported, _traced(len(memory)), lambda: reference)
+    observed = observation_elements(environment, groups, actor.obs_dim, terms, joint_order)
+    elements = ElementNames(observed, terms.elements, terms.control_rate_hz)
+    return restored(policy, elements, str(file), f"{type(actor).__module__}.{type(actor).__qualname__}", untrained)
+
+
+def _acting_part(
+    file: Path, agent_file: Path, agent: Mapping[str, Any], weights: Mapping[str, Any]
+) -> tuple[str, dict[str, Tensor]]:
+    """Return the part of agent.yaml that acts, and its weights."""
+    import torch
+
+    part = next((part for part, key in ACTORS.items() if key in weights), None)
+    state_dict = weights.get(ACTORS[part]) if part else None
+    if "model_state_dict" in weights or (isinstance(state_dict, dict) and {"std", "log_std"} & state_dict.keys()):
+        raise UnsupportedError(
+            f"{file} is of rsl_rl 2, 3 or 4, whose networks rsl_rl 5 does not load: give its actor to "
+            "rlservo.export_policy, as examples/rsl_rl_older.py does"
+        )
+    if part is None or part not in agent:
+        raise UnsupportedError(
+            f"{file}: expected the weights and settings of an actor as rsl_rl 5 writes them (actor_state_dict, and "
+            f"'actor' in {agent_file}), got {', '.join(sorted(map(str, weights))[:4])}"
+        )
+    if not isinstance(state_dict, dict) or not all(isinstance(each, torch.Tensor) for each in state_dict.values()):
+        raise CheckpointError(f"{file}: its '{ACTORS[part]}' is no dictionary of tensors")
+    return part, state_dict
+
+
+def _clip_actions(agent_file: Path, agent: Mapping[str, Any]) -> float | None:
+    limit = agent.get("clip_actions")
+    if limit is None:
+        return None
+    if not isinstance(limit, int | float) or not 0 <= limit < np.inf:
+        raise CheckpointError(f"{agent_file}: clip_actions is {limit!r}: expected null, or a finite number")
+    return float(limit)
+
+
+def _groups(agent_file: Path, agent: Mapping[str, Any], part: str) -> list[str]:
+    """Return the groups that the part's observation concatenates; rsl_rl's own default is 'policy'."""
+    from rlservo.export.sources.isaac_env import section
+
+    groups = section(agent, "obs_groups", agent_file).get(part, ["policy"])
+    if not isinstance(groups, list) or not groups or not all(isinstance(group, str) for group in groups):
+        raise CheckpointError(f"{agent_file}: obs_groups has {groups!r} for the {part}: expected a list of names")
+    return groups
 
 
 def _actor(file: Path, agent: Mapping[str, Any], part: str, state_dict: Mapping[str, Tensor]) -> Any:
@@ -160,17 +224,21 @@ def _actor(file: Path, agent: Mapping[str, Any], part: str, state_dict: Mapping[
     from rsl_rl.utils import resolve_class
     from tensordict import TensorDict
 
+    from rlservo.export.sources.isaac_env import section
+
     try:
-        kind, settings = resolve_class(agent[part])
+        kind, settings = resolve_class(dict(section(agent, part, file.parent / AGENT)))
+    except CheckpointError:
+        raise
     except Exception as error:  # a class of the user's own is imported
         raise CheckpointError(f"{file}: the class of its {part} cannot be imported: {explain(error)}") from error
     if not (isinstance(kind, type) and issubclass(kind, MLPModel)) or any("cnn" in key for key in state_dict):
         raise UnsupportedError(f"{file}: its {part} is a {kind}: only rsl_rl's models of vectors are exported")
     first = next((key for key in ("rnn.rnn.weight_ih_l0", "mlp.0.weight") if key in state_dict), None)
-    if first is None:
+    if first is None or state_dict[first].ndim != 2:
         raise UnsupportedError(f"{file}: its {part} has no layer mlp.0 or rnn.rnn: the observation's size is unknown")
     obs = TensorDict({"obs": torch.zeros(1, state_dict[first].shape[1])}, batch_size=[1])
-    rows = int(state_dict[_last(state_dict)].shape[0])
+    rows = int(state_dict[_last(state_dict)].shape[0]) if _last(state_dict) else 0
     errors = []
     for size in (rows, rows // 2):  # a distribution may take two numbers for each action
         try:
@@ -184,10 +252,9 @@ def _actor(file: Path, agent: Mapping[str, Any], part: str, state_dict: Mapping[
 
 
 def _last(state_dict: Mapping[str, Tensor]) -> str:
-    """Return the name of the last layer's weights."""
-    return max(
-        (key for key in state_dict if re.fullmatch(r"mlp\.\d+\.weight", key)), key=lambda key: int(key.split(".")[1])
-    )
+    """Return the name of the last layer's weights; '' if there is none."""
+    numbers = [int(match[1]) for key in state_dict if (match := re.fullmatch(r"mlp\.(\d+)\.weight", key))]
+    return f"mlp.{max(numbers)}.weight" if numbers else ""
 
 
 def _filter(file: Path, actor: Any) -> ObservationFilter | None:
@@ -224,19 +291,70 @@ def _traced(count: int) -> Any:
     return act
 
 
-class _Reference:
-    """rsl_rl's inference policy; it keeps its memory itself, which is set to that of the gate's rows."""
+class _RslRlReference:
+    """The inference policy of rsl_rl's own runner, then the environment's action terms.
 
-    def __init__(self, actor: Any) -> None:
-        self._actor = actor
+    The policy keeps its memory itself, which is set to that of the gate's rows. Nothing of the recipe is used but the
+    sizes, with which other weights could not be loaded.
+    """
+
+    def __init__(
+        self, file: Path, part: str, sizes: tuple[int, int], environment: Path | None, joint_order: tuple[str, ...]
+    ) -> None:
+        from rlservo.export.sources.isaac_actions import process_actions
+
+        try:
+            settings = yaml.full_load((file.parent / AGENT).read_text("utf-8"))
+            self._runner, self._widths = _runner(file, settings, part, sizes)
+        except Exception as error:  # the user's own classes, or settings that no runner takes
+            raise CheckpointError(f"{file} cannot be restored by rsl_rl's own runner: {explain(error)}") from error
+        self._policy = self._runner.get_inference_policy()
+        self._process = process_actions(environment, joint_order, settings.get("clip_actions"))
 
     def __call__(self, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
         from tensordict import TensorDict
 
         if state:
             hidden = [leaf.transpose(0, 1).contiguous() for leaf in state]
-            self._actor.reset(hidden_state=tuple(hidden) if len(hidden) > 1 else hidden[0])
-        action = self._actor(TensorDict({"obs": obs}, batch_size=[len(obs)]))
-        after = self._actor.get_hidden_state() if state else ()
+            self._policy.reset(hidden_state=tuple(hidden) if len(hidden) > 1 else hidden[0])
+        groups = dict(zip(self._widths, obs.split(list(self._widths.values()), dim=-1), strict=True))
+        action = self._policy(TensorDict(groups, batch_size=[len(obs)]))
+        after = self._policy.get_hidden_state() if state else ()
         after = after if isinstance(after, tuple) else (after,)
-        return action, [leaf.transpose(0, 1) for leaf in after]
+        return self._process(action), [leaf.transpose(0, 1) for leaf in after]
+
+
+def _runner(file: Path, settings: dict[str, Any], part: str, sizes: tuple[int, int]) -> tuple[Any, dict[str, int]]:
+    """Return rsl_rl's runner with the checkpoint loaded, and the width of each group of the part's observation.
+
+    What only trains is left out: the critic or teacher is the smallest, and extensions may need the user's code.
+    """
+    import torch
+    from rsl_rl.runners import DistillationRunner, OnPolicyRunner
+    from tensordict import TensorDict
+
+    other, runner = {"actor": ("critic", OnPolicyRunner), "student": ("teacher", DistillationRunner)}[part]
+    groups = {part: (settings.get("obs_groups") or {}).get(part, ["policy"]), other: ["trained"]}
+    rest = len(groups[part]) - 1  # no file has the groups' widths, and only their sum matters
+    widths = {group: 1 if number else sizes[0] - rest for number, group in enumerate(groups[part])}
+    seen = TensorDict({name: torch.zeros(1, width) for name, width in {**widths, "trained": 1}.items()}, batch_size=[1])
+    env = SimpleNamespace(num_envs=1, num_actions=sizes[1], device="cpu", cfg={}, get_observations=lambda: seen)
+    algorithm = {**settings["algorithm"], "rnd_cfg": None, "symmetry_cfg": None}
+    small = {"class_name": "MLPModel", "hidden_dims": [1]}
+    settings = {**settings, "algorithm": algorithm, other: small, "obs_groups": groups, "num_steps_per_env": 1,
+                "torch_compile_mode": None, "multi_gpu": None}  # fmt: skip
+    with _quiet():
+        made: Any = runner(env, settings, log_dir=None, device="cpu")
+        made.load(str(file), load_cfg={part: True}, map_location="cpu")  # load_weights has read it as weights alone
+    made.get_inference_policy().requires_grad_(False)
+    return made, widths
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep rsl_rl from printing models, from advice on training and from changing others' random numbers."""
+    import torch
+
+    with torch.random.fork_rng(), contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

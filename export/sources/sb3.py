@@ -14,15 +14,13 @@ import re
 import warnings
 import zipfile
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from gymnasium.spaces import Box, Dict
-
+from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.facts import CheckpointFacts
 from rlservo.export.checkpoints.unpickle import explain, unpickle, unpickle_bytes
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source, one_policy
 
 if TYPE_CHECKING:
@@ -32,6 +30,11 @@ MEMBERS = {"data", "policy.pth", "_stable_baselines3_version"}
 SERIALIZED = ":serialized:"
 LOADED = ("policy_class", "policy_kwargs", "observation_space", "action_space")
 """The zip's pickles that acting needs."""
+SMALL, INFLATION = 64_000_000, 20
+"""Size of a zip's member that is read whatever the file's own, in bytes, and its largest multiple of the file's."""
+GYM = "reading them needs gym and shimmy: pip install gym==0.26.2 shimmy"
+NO_STATISTICS = Path("none")
+"""Value of `vecnormalize` for a model that is exported without statistics, whatever lies beside it."""
 HARMLESS: dict[str, Any] = {
     "learning_rate": 0.0, "clip_range": 0.2, "train_freq": 1, "buffer_size": 1, "n_steps": 1, "n_envs": 1,
     "target_entropy": 0.0, "seed": None, "optimize_memory_usage": False, "replay_buffer_kwargs": {},
@@ -64,9 +67,10 @@ class StableBaselines3(Source):
     packages = ("stable_baselines3", "sb3_contrib")
     expects = "the zip that Stable-Baselines3's model.save wrote, or a folder with one"
     reference = (
-        "Stable-Baselines3's own VecNormalize.normalize_obs, frame stack and predict(deterministic=True), restored "
-        "from the zip by the algorithm's own load"
+        "predict(deterministic=True) of the model that Stable-Baselines3's own load gives, in an environment behind "
+        "its own VecNormalize, VecFrameStack and VecTransposeImage"
     )
+    options = ("--vecnormalize", "--frame-stack")
 
     def detects(self, path: Path) -> bool:
         return bool(_zips(path))
@@ -84,7 +88,8 @@ class StableBaselines3(Source):
 
     def facts(self, files: PolicyFiles, notify: Notify) -> CheckpointFacts:  # noqa: ARG002  # nothing is left out
         data = read_data(files.root)
-        algorithm = algorithm_path(data, load_member(files.root, data, "policy_class"))
+        policy_class = load_member(files.root, data, "policy_class")
+        algorithm = algorithm_path(data, policy_class) if isinstance(policy_class, type) else ""
         steps = data.get("num_timesteps")
         return CheckpointFacts(
             algorithm=algorithm.rpartition(":")[2] or "unknown", env_steps=steps if isinstance(steps, int) else None
@@ -97,20 +102,10 @@ class StableBaselines3(Source):
         data = read_data(file)
         for member in LOADED:  # the framework's own loader hides what is missing behind an unrelated error
             load_member(file, data, member)
-        # One to act as the reference, one to trace: a policy with state-dependent exploration cannot be copied.
-        policy, traced = (load_model(file, data).policy for _ in range(2))
-        statistics = options.vecnormalize or statistics_beside(file)
-        if statistics is None and looks_normalized(file, data):
-            raise CheckpointError(
-                f"{file}: the model was trained with VecNormalize, whose statistics are not beside it: looked for "
-                "vecnormalize.pkl; give the file that VecNormalize.save wrote with --vecnormalize"
-            )
-        if statistics is None:
-            notify("no vecnormalize.pkl beside the model: it is exported as trained without VecNormalize")
-        else:
-            notify(f"the observations are normalized by {statistics}")
+        statistics = find_statistics(file, data, options.vecnormalize, notify)
         vec = None if statistics is None else load_statistics(statistics)
-        return restore_policy(file, policy, traced, vec, options, notify)
+        # It is loaded twice, to act as the reference and to be traced: state-dependent exploration cannot be copied.
+        return restore_policy(file, partial(load_model, file, data), statistics, vec, options, notify)
 
 
 def _zips(path: Path) -> list[Path]:
@@ -122,7 +117,7 @@ def _is_model(file: Path) -> bool:
     try:
         with zipfile.ZipFile(file) as archive:
             return set(archive.namelist()) >= MEMBERS
-    except (OSError, zipfile.BadZipFile):
+    except Exception:  # a damaged zip raises almost anything
         return False
 
 
@@ -140,13 +135,45 @@ def statistics_beside(model: Path) -> Path | None:
     return next((file for file in [*found, *(inside if len(inside) == 1 else [])] if file.is_file()), None)
 
 
+def find_statistics(model: Path, data: Mapping[str, Any], given: Path | None, notify: Notify) -> Path | None:
+    """Return the file of VecNormalize's statistics: the given one, else the one beside the model; None without them.
+
+    Raises CheckpointError if the model was trained behind VecNormalize, and there is none.
+    """
+    if given == NO_STATISTICS:
+        notify("the model is exported without VecNormalize")
+        return None
+    if (statistics := given or statistics_beside(model)) is not None:
+        notify(f"the observations are normalized by {statistics}")
+        return statistics
+    if shows_vecnormalize(data):
+        raise CheckpointError(
+            f"{model}: the model was trained behind VecNormalize, whose statistics are not beside it: looked for "
+            "vecnormalize.pkl; give the file that VecNormalize.save wrote with --vecnormalize, or --vecnormalize none "
+            "if only rewards were normalized"
+        )
+    unknown = ", which an off-policy model does not record" if "replay_buffer_class" in data else ""
+    notify(f"no vecnormalize.pkl beside the model: it is exported as trained without VecNormalize{unknown}")
+    return None
+
+
 def read_data(file: Path) -> dict[str, Any]:
     """Return the model's settings; those that are not JSON stay pickled."""
     try:
         with zipfile.ZipFile(file) as archive:
-            return dict(json.loads(archive.read("data")))
-    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
+            inflated = max(0, *(member.file_size for member in archive.infolist()))
+            if inflated > max(SMALL, INFLATION * file.stat().st_size):
+                raise CheckpointError(f"it has a member of {inflated:,} bytes in a file of {file.stat().st_size:,}: "
+                                      "model.save compresses nothing")  # fmt: skip
+            data = json.loads(archive.read("data"))
+    except RecursionError as error:
+        raise CheckpointError(f"{file} cannot be read: its 'data' is nested too deeply") from error
+    except Exception as error:  # a damaged zip raises almost anything
         raise CheckpointError(f"{file} cannot be read: {explain(error)}") from error
+    if not isinstance(data, dict):
+        raise CheckpointError(f"{file} cannot be read: its 'data' is a JSON {type(data).__name__}, expected the "
+                              "settings that model.save wrote")  # fmt: skip
+    return data
 
 
 def load_member(file: Path, data: Mapping[str, Any], name: str) -> Any:
@@ -156,7 +183,17 @@ def load_member(file: Path, data: Mapping[str, Any], name: str) -> Any:
     kept = data[name]
     if not (isinstance(kept, dict) and SERIALIZED in kept):
         return kept
-    return unpickle_bytes(base64.b64decode(kept[SERIALIZED]), f"{file}: its '{name}'")
+    try:
+        pickled = base64.b64decode(kept[SERIALIZED])
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{file}: its '{name}' is not base64: {error}") from error
+    try:
+        return unpickle_bytes(pickled, f"{file}: its '{name}'")
+    except CheckpointError as error:
+        cause = error.__cause__
+        if isinstance(cause, ModuleNotFoundError) and (cause.name or "").partition(".")[0] == "gym":
+            raise CheckpointError(f"{file} was saved by Stable-Baselines3 1 with Gym's spaces: {GYM}") from error
+        raise
 
 
 def algorithm_path(data: Mapping[str, Any], policy_class: type) -> str:
@@ -171,9 +208,14 @@ def algorithm_path(data: Mapping[str, Any], policy_class: type) -> str:
     return ""
 
 
-def load_model(file: Path, data: Mapping[str, Any]) -> Any:
-    """Return the model as its algorithm's own `load` gives it, on the CPU and without what only training needs."""
+def load_model(file: Path, data: Mapping[str, Any], env: Any = None) -> Any:
+    """Return the model as its algorithm's own `load` gives it, on the CPU and without what only training needs.
+
+    With an environment, `load` puts it behind VecTransposeImage if it gives images, and compares the spaces.
+    """
     policy_class = load_member(file, data, "policy_class")
+    if not isinstance(policy_class, type):
+        raise CheckpointError(f"{file}: its 'policy_class' is {str(policy_class)[:60]!r}, expected a class")
     path = algorithm_path(data, policy_class)
     if not path:
         raise UnsupportedError(
@@ -189,31 +231,32 @@ def load_model(file: Path, data: Mapping[str, Any]) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about training's settings, which were replaced
-            return getattr(importlib.import_module(module), name).load(file, device="cpu", custom_objects=unneeded)
+            return getattr(importlib.import_module(module), name).load(
+                file, env=env, device="cpu", custom_objects=unneeded
+            )
     except Exception as error:  # whatever the framework, torch or the user's own constructor raises
+        if "shimmy" in str(error):
+            raise CheckpointError(f"{file} was saved by Stable-Baselines3 1 with Gym's spaces: {GYM}") from error
         # torch says which weights do not fit on the lines below the first.
         reason = " ".join(str(error).split())[:300] if "state_dict" in str(error) else explain(error)
         raise CheckpointError(f"{file} cannot be restored as {name}: {reason}") from error
 
 
-def looks_normalized(file: Path, data: Mapping[str, Any]) -> bool:
-    """Return whether the last observation of training shows VecNormalize: changed, or outside of the space."""
-    try:
-        last, original = (load_member(file, data, name) for name in ("_last_obs", "_last_original_obs"))
-        space = load_member(file, data, "observation_space")
-    except CheckpointError:
-        return False
-    spaces = space.spaces if isinstance(space, Dict) else {"": space}
-    lasts, originals = (each if isinstance(each, dict) else {"": each} for each in (last, original))
-    for key, leaf in spaces.items():
-        now, before = lasts.get(key), originals.get(key)
-        if isinstance(before, np.ndarray) and isinstance(now, np.ndarray) and not np.array_equal(now, before):
-            return True
-        if not (isinstance(leaf, Box) and isinstance(now, np.ndarray) and np.dtype(leaf.dtype).kind == "f"):
-            continue
-        if not ((now >= leaf.low - 1e-3) & (now <= leaf.high + 1e-3)).all():
-            return True
-    return False
+def shows_vecnormalize(data: Mapping[str, Any]) -> bool:
+    """Return whether the model was certainly trained behind VecNormalize.
+
+    Algorithms on policy keep the original observation only then. Those off policy keep the previous one in its place,
+    which pickles to the same length as the last one unless that was normalized, to single precision. If the
+    environment's are of single precision too, the model does not show it.
+    """
+    last, original = (_pickled(data.get(name)) for name in ("_last_obs", "_last_original_obs"))
+    if "replay_buffer_class" in data:
+        return len(last) != len(original)
+    return bool(original)
+
+
+def _pickled(kept: Any) -> str:
+    return str(kept[SERIALIZED]) if isinstance(kept, dict) and SERIALIZED in kept else ""
 
 
 def load_statistics(file: Path) -> Any:

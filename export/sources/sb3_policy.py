@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import inspect
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,12 +14,12 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
 from numpy.typing import NDArray
 from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
-from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 from torch import Tensor, nn
 
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
-from rlservo.export.contract.scores import ACTION_DIST_INPUTS, Q_VALUES
+from rlservo.bundle.scores import ACTION_DIST_INPUTS, Q_VALUES
+from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.recipe.recipe import (
     DistributionKind,
     FrameStack,
@@ -31,13 +30,17 @@ from rlservo.export.recipe.recipe import (
     Transform,
     Transpose,
 )
-from rlservo.export.recipe.runners import Inputs, Outputs
-from rlservo.export.recipe.trees import Tree, build
+from rlservo.export.recipe.runners import Inputs
+from rlservo.export.recipe.trees import Tree, build, build_in_order
 from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
+from rlservo.export.sources.sb3_reference import PredictLoop, Wrappers, load_acting
 from rlservo.export.sources.source import Notify, RestoreOptions
 
 OBSERVATIONS, ACTION_MASK = "observations", "action_mask"
 """Keys of the observation of a policy with action masks, as RLlib's examples have them."""
+ACTING = ("predict", "_predict", "obs_to_tensor", "unscale_action")
+"""Methods through which predict passes around a policy's networks; `forward` is one of them if nothing else acts."""
+LIBRARIES = ("stable_baselines3", "sb3_contrib")
 MASKED = torch.finfo(torch.float32).min
 
 
@@ -54,16 +57,24 @@ class Layout:
 
 
 def restore_policy(
-    file: Path, policy: Any, traced: Any, vec: Any, options: RestoreOptions, notify: Notify
+    file: Path, load: Callable[[Any], Any], statistics: Path | None, vec: Any, options: RestoreOptions, notify: Notify
 ) -> RestoredPolicy:
-    """Return the policy for the exporter, `traced` being a second one. `vec` is VecNormalize's statistics, or None."""
+    """Return the policy for the exporter; `load` gives the model, for an environment or None.
+
+    `vec` is the VecNormalize that the file `statistics` holds, or None.
+    """
+    policy = load(None).policy
+    _check_methods(file, policy)
     for key in diverged_weights(policy):
         raise CheckpointError(f"{file}: the weights '{key}' are not all finite: training diverged")
-    for one in (policy, traced):
-        one.set_training_mode(False)
-        one.requires_grad_(False)
     layout = find_layout(file, policy.observation_space, vec, options.frame_stack)
     _check_spaces(file, layout.frame, policy.action_space)
+    _notify_assumptions(layout, vec, notify)
+    acting, wrappers = load_acting(file, load, layout.frame, policy.action_space, statistics, layout.frames)
+    _check_order(file, layout, wrappers)
+    for one in (policy, acting.policy):
+        one.set_training_mode(False)
+        one.requires_grad_(False)
     rule = Rule.of(policy, options.value, notify)
     observation_space, steps = layout.frame, layout.steps
     if rule.masked:
@@ -71,7 +82,7 @@ def restore_policy(
         if isinstance(layout.frame, Dict):
             if ACTION_MASK in layout.frame.spaces:
                 raise UnsupportedError(f"{file}: the observation has a part '{ACTION_MASK}' already: rename it")
-            observation_space = Dict({**layout.frame.spaces, ACTION_MASK: mask})
+            observation_space = Dict([*layout.frame.spaces.items(), (ACTION_MASK, mask)])
         else:
             observation_space = Dict({OBSERVATIONS: layout.frame, ACTION_MASK: mask})
             steps = tuple(replace(step, leaf=f"obs.{OBSERVATIONS}") for step in steps)
@@ -87,11 +98,81 @@ def restore_policy(
     kind = type(policy)
     return RestoredPolicy(
         recipe,
-        Network(traced, rule),
+        SB3Network(policy, rule),
         f"{kind.__module__}.{kind.__qualname__}",
-        partial(PredictLoop, policy, rule, Scores(policy, rule), recipe, layout, vec),
+        partial(
+            PredictLoop,
+            acting,
+            wrappers,
+            layout.frame,
+            partial(_read, recipe, rule, policy.observation_space),
+            Scores(acting.policy, rule).numbers,
+            rule.names,
+            tuple(leaf.name for leaf in state),
+        ),
         untrained_filter=untrained,
     )
+
+
+def _notify_assumptions(layout: Layout, vec: Any, notify: Notify) -> None:
+    """Say what neither the zip nor the statistics show."""
+    shapes = {key: space.shape for key, space in _leaves(layout.frame).items()}
+    if layout.frames > 1 and (vec is None or not layout.normalized_first):
+        notify(
+            f"the zip does not record frames: an observation is taken for {layout.frames} frames of one VecFrameStack, "
+            f"of shape {', '.join(map(str, shapes.values()))} each"
+        )
+    for step in layout.steps:
+        if isinstance(step, Transpose):
+            notify(f"{step.leaf}: an image is taken with its channels last, as VecTransposeImage takes it")
+        if (
+            isinstance(step, ObservationFilter)
+            and (np.abs(step.mean) < 0.3).all()
+            and (abs(np.log(step.std)) < 0.5).all()
+        ):
+            notify(
+                f"{step.leaf}: VecNormalize's statistics are those of numbers that are normalized already: if another "
+                "VecNormalize was below it, its file does not hold that one, and the export is wrong"
+            )
+
+
+def _check_methods(file: Path, policy: Any) -> None:
+    """Raise UnsupportedError for a class of the user's own that acts outside of its network."""
+    for part in policy.modules():
+        names = ACTING if hasattr(part, "get_distribution") else (*ACTING, "forward")
+        for name in names if isinstance(part, BasePolicy) else ():
+            owner = next(kind for kind in type(part).__mro__ if name in vars(kind))
+            if owner.__module__.partition(".")[0] not in LIBRARIES:
+                raise UnsupportedError(
+                    f"{file}: the policy's class {owner.__module__}.{owner.__qualname__} has a '{name}' of its own, "
+                    "which is not exported: a graph holds the networks, so put what it does into them or into the "
+                    "features extractor"
+                )
+
+
+def _check_order(file: Path, layout: Layout, wrappers: Wrappers) -> None:
+    """Raise CheckpointError if the recipe's steps are not in the order that Stable-Baselines3's own wrappers accept."""
+    called = {ObservationFilter: "VecNormalize", FrameStack: "VecFrameStack", Transpose: "VecTransposeImage"}
+    steps = tuple(dict.fromkeys(called[type(step)] for step in layout.steps))
+    accepted = tuple(name for name in wrappers.names if name in steps or name != "VecNormalize")
+    if steps != accepted:
+        raise CheckpointError(
+            f"{file}: by the shapes of model and statistics an observation passes {', '.join(steps) or 'no wrapper'}, "
+            f"by Stable-Baselines3's own checks {', '.join(accepted) or 'none'}: give the --vecnormalize and "
+            "--frame-stack of its training"
+        )
+
+
+def _read(recipe: Recipe, rule: Rule, model_space: Any, inputs: Inputs) -> tuple[Tree, NDArray[Any] | None]:
+    """Return the environment's observation of a graph's inputs, and the action masks."""
+    if any(isinstance(step, FrameStack) for step in recipe.steps):
+        obs = build_in_order(recipe.observation_space, inputs)  # VecFrameStack sorts its space, and not what it gives
+    else:
+        obs = build(recipe.observation_space, [inputs[name] for name in recipe.observation_leaves])
+    if not rule.masked:
+        return obs, None
+    mask, obs = _unmask(obs, model_space)
+    return obs, mask
 
 
 @dataclass(frozen=True)
@@ -109,7 +190,7 @@ class Rule:
 
     @staticmethod
     def of(policy: Any, value: bool, notify: Notify) -> Rule:
-        """Return the rule by the parts of the policy. The gate refuses a class of the user's own with another rule."""
+        """Return the rule by the parts of the policy."""
         space = policy.action_space
         transform: Transform = "none"
         if isinstance(space, Box):
@@ -175,8 +256,12 @@ class Scores:
             scores = torch.cat((scores, self._policy.log_std.expand_as(scores)), dim=-1)
         return scores if mask is None else torch.where(mask.bool(), scores, torch.tensor(MASKED))
 
+    def numbers(self, mask: NDArray[Any] | None) -> NDArray[Any]:
+        """Return them as `take` does, detached from the policy."""
+        return np.asarray(self.take(None if mask is None else torch.from_numpy(mask)).detach().numpy().copy())
 
-class Network(nn.Module):
+
+class SB3Network(nn.Module):
     """The policy's deterministic prediction as a module that can be traced."""
 
     def __init__(self, policy: Any, rule: Rule) -> None:
@@ -227,65 +312,6 @@ def _shaped(action: Tensor, space: Any) -> Tensor:
     return action if isinstance(space, Box) else action.long()
 
 
-class PredictLoop:
-    """`VecNormalize.normalize_obs`, the frame stack and `policy.predict(deterministic=True)`, step after step."""
-
-    def __init__(self, policy: Any, rule: Rule, scores: Scores, recipe: Recipe, layout: Layout, vec: Any) -> None:
-        self._policy, self._rule, self._scores = policy, rule, scores
-        self._recipe, self._layout, self._vec = recipe, layout, vec
-        self._stacks: list[StackedObservations[Any]] = []
-        self._state: Any = None
-
-    def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
-        """Return what the model predicts for one step of every row, by output name."""
-        policy, rule = self._policy, self._rule
-        obs = build(self._recipe.observation_space, [inputs[name] for name in self._recipe.observation_leaves])
-        mask = None
-        how: dict[str, Any] = {}
-        if rule.masked:
-            mask, obs = _unmask(obs, policy.observation_space)
-            how["action_masks"] = mask
-        if self._vec is not None and self._layout.normalized_first:
-            obs = self._vec.normalize_obs(obs)
-        if self._layout.frames > 1:
-            obs = self._stack(obs, restart)
-        if self._vec is not None and not self._layout.normalized_first:
-            obs = self._vec.normalize_obs(obs)
-        if rule.recurrent:
-            how |= {"state": self._state, "episode_start": restart}
-        actions, self._state = policy.predict(obs, deterministic=True, **how)
-        space = self._recipe.action_space
-        outputs = {"action": actions if isinstance(space, Box) else actions.astype(np.int64)}
-        with torch.no_grad():
-            for name in rule.names:
-                if name == "value":
-                    outputs[name] = policy.predict_values(policy.obs_to_tensor(obs)[0]).squeeze(-1).numpy()
-                else:
-                    outputs[name] = self._scores.take(None if mask is None else torch.from_numpy(mask)).numpy().copy()
-        for leaf, values in zip(self._recipe.network_state, self._state or (), strict=False):
-            outputs[f"state_out.{leaf.name}"] = np.swapaxes(values, 0, 1)
-        return outputs
-
-    def _stack(self, obs: Tree, restart: NDArray[np.bool_]) -> Tree:
-        """Return the stacked observations; each row has a stack of its own."""
-        if not self._stacks:
-            self._stacks = [
-                StackedObservations(1, self._layout.frames, self._layout.frame) for _ in range(len(restart))
-            ]
-        rows = []
-        for row, stack in enumerate(self._stacks):
-            frame = _rows(obs, slice(row, row + 1))
-            stacked = stack.reset(frame) if restart[row] else stack.update(frame, np.array([False]), [{}])[0]
-            rows.append(copy.deepcopy(stacked))
-        if isinstance(rows[0], dict):
-            return {key: np.concatenate([row[key] for row in rows]) for key in rows[0]}
-        return np.concatenate(rows)
-
-
-def _rows(obs: Tree, rows: slice) -> Tree:
-    return {key: value[rows] for key, value in obs.items()} if isinstance(obs, dict) else obs[rows]
-
-
 def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     """Return the steps from one frame of the environment to the model's observation.
 
@@ -321,22 +347,24 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     for key, (whole, axis) in stacked.items():
         if frames > 1 and (not isinstance(whole, Box) or not whole.shape or whole.shape[axis] % frames):
             raise CheckpointError(f"{file}: {whole} is not a stack of {frames} frames")
-        frame_spaces[key] = whole if frames == 1 else _first_frame(whole, axis, frames)
+        frame_spaces[key] = whole if frames == 1 else _first_frame(file, whole, axis, frames)
     is_dict = isinstance(model_space, Dict)
     steps = [Transpose(_leaf(key)) for key in transposed]
     stacks = [
-        FrameStack(frames, frame_spaces[key].shape, _stack_dtype(vec, key, frame_spaces[key], normalized_first),
+        FrameStack(frames, frame_spaces[key].shape,
+                   _stack_dtype(file, key, frame_spaces[key], normalized_first and _is_normalized(vec, key)),
                    leaf=_leaf(key), channels_first=axis == 0)
         for key, (_, axis) in stacked.items() if frames > 1
     ]  # fmt: skip
     filters = _filters(vec)
     before: list[ObservationFilter | FrameStack] = [*filters, *stacks] if normalized_first else [*stacks, *filters]
-    frame = Dict(frame_spaces) if is_dict else frame_spaces[""]
+    frame = Dict(list(frame_spaces.items())) if is_dict else frame_spaces[""]
     return Layout(frame, frames, normalized_first, (*before, *steps))
 
 
 def _leaves(space: Any) -> dict[str, Any]:
-    return dict(space.spaces) if isinstance(space, Dict) else {"": space}
+    inside = getattr(space, "spaces", None)  # a Dict of Gym's in older statistics has them too
+    return dict(inside) if isinstance(inside, Mapping) else {"": space}
 
 
 def _leaf(key: str) -> str:
@@ -356,14 +384,30 @@ def _channels_last(space: Any) -> Box:
     return Box(low, high, dtype=space.dtype.type)
 
 
-def _first_frame(space: Any, axis: int, frames: int) -> Box:
-    low, high = (np.split(side, frames, axis=axis)[0] for side in (space.low, space.high))
+def _first_frame(file: Path, space: Any, axis: int, frames: int) -> Box:
+    """Return one frame's space: VecFrameStack repeats each bound before the next one (stable-baselines3 2.9)."""
+    size = space.shape[axis] // frames
+    low, high = (np.take(side, np.arange(size) * frames, axis) for side in (space.low, space.high))
+    if any((np.repeat(one, frames, axis) != side).any() for one, side in ((low, space.low), (high, space.high))):
+        raise CheckpointError(
+            f"{file}: the bounds of {space} are not those that a VecFrameStack of {frames} frames gives: give the "
+            "--frame-stack of its training"
+        )
     return Box(low, high, dtype=space.dtype.type)
 
 
-def _stack_dtype(vec: Any, key: str, space: Box, normalized_first: bool) -> str:
-    filtered = vec is not None and normalized_first and vec.norm_obs and (not key or key in vec.norm_obs_keys)
-    return "float32" if filtered else str(space.dtype)
+def _is_normalized(vec: Any, key: str) -> bool:
+    return vec is not None and vec.norm_obs and (not key or key in vec.norm_obs_keys)
+
+
+def _stack_dtype(file: Path, key: str, space: Box, normalized: bool) -> str:
+    """Return the type of a stack's frames. Raises UnsupportedError for one that does not hold normalized numbers."""
+    if normalized and space.dtype not in (np.float32, np.float64):
+        raise UnsupportedError(
+            f"{file}: {_leaf(key)}: VecFrameStack keeps what VecNormalize gives as {space.dtype}, the environment's "
+            "type, and so cuts it off: stack below VecNormalize, or let the environment give float32"
+        )
+    return "float32" if normalized else str(space.dtype)
 
 
 def _filters(vec: Any) -> list[ObservationFilter]:

@@ -11,6 +11,7 @@ import io
 import logging
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -18,11 +19,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 
+from rlservo.bundle.scores import ACTION_DIST_INPUTS, Q_VALUES
+from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.facts import CheckpointFacts
 from rlservo.export.checkpoints.unpickle import explain
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
-from rlservo.export.contract.scores import ACTION_DIST_INPUTS, Q_VALUES
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe
+from rlservo.export.sources.rsl_rl import environment_files, load_weights
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source, one_policy
 
 if TYPE_CHECKING:
@@ -31,8 +33,6 @@ if TYPE_CHECKING:
     from rlservo.export.sources.restored_policy import RestoredPolicy
 
 PARAMS = "params"
-AFTER_EXPLORATION = 10**9
-"""A time step at which no algorithm draws its actions at random any more."""
 _AGENT = re.compile(r"agent_(\d+)\.pt")
 
 
@@ -46,38 +46,37 @@ class Skrl(Source):
     packages = ("skrl",)
     expects = "skrl's agent_*.pt of a run with params/agent.yaml, or the run's folder"
     reference = (
-        "skrl's own agent, restored by its runner and agent.load: agent.act with its preprocessor, the mean action; "
-        "then the scale and offset of the environment's action terms"
+        "skrl's own agent, restored by its runner and agent.load: agent.act with its preprocessor, the mean action or "
+        "the likeliest choice; then process_actions of the environment's action terms, as Isaac Lab computes it"
     )
+    options = ("--joint-order",)
 
     def detects(self, path: Path) -> bool:
         found = find_run(path)
-        return found is not None and bool(re.search(r"^models:", found[1].read_text("utf-8"), re.M))
+        return found is not None and bool(re.search(r"^models:", found[1].read_text("utf-8", errors="replace"), re.M))
 
     def locate(self, path: Path, module_id: str | None, agent_id: str | None) -> PolicyFiles:
         given = path.expanduser().absolute()
         found = find_run(given)
         if found is None:
             raise CheckpointError(f"{given} is not a run of skrl: expected {self.expects}")
-        environment = found[1].with_name("env.yaml")
-        files = [*found, *([environment] if environment.is_file() else [])]
-        return one_policy(found[0], files, module_id, agent_id)
+        return one_policy(found[0], [*found, *environment_files(found[1])], module_id, agent_id)
 
     def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002
         return "its agent.yaml holds expressions that skrl evaluates; export only those you trust"
 
     def facts(self, files: PolicyFiles, notify: Notify) -> CheckpointFacts:  # noqa: ARG002
-        from rlservo.export.sources.isaac_env import read_yaml
+        from rlservo.export.sources.isaac_env import read_yaml, section
 
         found = find_run(files.root)
-        agent = (read_yaml(found[1]) if found else {}).get("agent") or {}
+        agent = section(read_yaml(found[1]), "agent", found[1]) if found else {}
         match = _AGENT.fullmatch(files.root.name)
         return CheckpointFacts(str(agent.get("class") or "unknown"), env_steps=int(match[1]) if match else None)
 
-    def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:  # noqa: ARG002
+    def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:
         found = find_run(files.root)
         assert found is not None, "locate has found it"
-        return _restore(*found, notify)
+        return _restore(*found, options.joint_order, notify)
 
 
 def find_run(path: Path) -> tuple[Path, Path] | None:
@@ -95,89 +94,165 @@ def find_run(path: Path) -> tuple[Path, Path] | None:
     return None if agent is None else (weights, agent)
 
 
-def _restore(file: Path, agent_file: Path, notify: Notify) -> RestoredPolicy:
+def _restore(file: Path, agent_file: Path, joint_order: tuple[str, ...], notify: Notify) -> RestoredPolicy:
     from rlservo.export.sources.isaac_env import ActionTerms, action_terms, read_yaml
+    from rlservo.export.sources.isaac_observations import observation_elements
     from rlservo.export.sources.restored_policy import ElementNames
     from rlservo.export.sources.torch_policy import TorchPolicy, restored
 
     config = read_yaml(agent_file)
-    kind = str((config.get("agent") or {}).get("class"))
-    if kind.lower().endswith("_rnn"):
-        raise UnsupportedError(
-            f"{file} is of a recurrent agent ({kind}), and agent.yaml does not describe its models: make the agent in "
-            "Python and export it with rlservo.export_policy, as examples/skrl_recurrent.py does"
-        )
-    weights = _load(file)
-    observation_space, state_space, action_space = _spaces(file, config, weights)
-    agent, acting = (_agent(file, config, (observation_space, state_space, action_space)) for _ in range(2))
-    policy = agent.models["policy"]
+    layout = _layout(file, agent_file, config, load_weights(file))
+    agent = _agent(file, config, layout)
     environment = agent_file.with_name("env.yaml")
-    terms = ActionTerms(notes=("no params/env.yaml: the export gives the policy's own numbers, unscaled",))
-    if isinstance(action_space, Box):
-        if environment.is_file():
-            terms = action_terms(read_yaml(environment), action_space.shape[0], None)
-        for note in terms.notes:
-            notify(note)
+    terms = ActionTerms()
+    if layout.choices is None:
+        terms = action_terms(environment, layout.actions, None, joint_order)
+    for note in terms.notes:
+        notify(note)
     frozen = _filter(file, agent)
-    scored = isinstance(action_space, Discrete)
-    is_q = "q_network" in agent.models
+    low, high = terms.bounds or (-np.inf, np.inf)
+    action_space = Box(low, high, (layout.actions,), np.float32) if layout.choices is None else Discrete(layout.actions)
     recipe = Recipe(
-        observation_space,
+        _unbounded(layout.observed),
         action_space,
         (frozen,) if frozen else (),
-        "argmax" if scored else "given",
-        "none",
-        None if is_q or not scored else "categorical",
+        "given" if layout.choices is None else "argmax",
+        "clip" if terms.bounds else "none",
+        "categorical" if layout.choices in ("log_probabilities", "probabilities") else None,
         affine=terms.affine,
     )
 
     def act(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
-        return policy.compute({"observations": obs, "states": None}, "policy")[0], state
+        output = policy.compute({"observations": obs, "states": None}, layout.role)[0]
+        return _scores(output, layout.choices), state
 
-    def reference(obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
-        actions, outputs = acting.act(obs, None, timestep=AFTER_EXPLORATION, timesteps=AFTER_EXPLORATION)
-        return outputs["net_output"] if scored and "net_output" in outputs else outputs.get(
-            "mean_actions", actions
-        ), state
-
+    reference = _SkrlReference(file, agent_file, layout, environment if terms.processed else None, joint_order)
     untrained = f"the scaler's statistics come from {frozen.count} observation" if frozen and frozen.count <= 1 else ""
-    names = (Q_VALUES if is_q else ACTION_DIST_INPUTS,) if scored else ()
-    traced = TorchPolicy(recipe, policy, act, lambda: reference, names)
-    return restored(traced, ElementNames((), terms.elements, terms.control_rate_hz), str(file), "", untrained)
+    names = {None: (), "q_values": (Q_VALUES,)}.get(layout.choices, (ACTION_DIST_INPUTS,))
+    traced = TorchPolicy(recipe, agent.models[layout.role], act, lambda: reference, names)
+    observed = observation_elements(environment, ("policy",), layout.observed, terms, joint_order)
+    return restored(traced, ElementNames(observed, terms.elements, terms.control_rate_hz), str(file), "", untrained)
 
 
-def _load(file: Path) -> dict[str, Any]:
-    from rlservo.export.sources.rsl_rl import load_weights
+def _scores(output: Tensor, choices: str | None) -> Tensor:
+    """Return what a choice is drawn by: logarithms of probabilities, whichever of both a model gives."""
+    import torch
 
-    weights = load_weights(file)
-    if not isinstance(weights.get("policy"), Mapping):
-        raise UnsupportedError(f"{file} holds no weights of a 'policy': it holds {', '.join(sorted(weights)[:5])}")
-    return weights
+    if choices == "log_probabilities":
+        return torch.log_softmax(output, dim=-1)
+    if choices == "probabilities":
+        tiny = torch.finfo(output.dtype).eps
+        return (output / output.sum(-1, keepdim=True)).clamp(tiny, 1 - tiny).log()
+    return output
 
 
-def _spaces(file: Path, config: Mapping[str, Any], weights: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """Return the spaces of observation, state (None) and action, with the weights' sizes."""
-    models = config.get("models") or {}
-    of_policy = models.get("policy") or {}
-    kind = str(of_policy.get("class", ""))
+class _SkrlReference:
+    """The agent of skrl's own runner, made from skrl's own reading of agent.yaml, then the environment's action terms.
+
+    Exploration is off: random first steps, noise, and drawing at random are settings of the agent.
+    """
+
+    def __init__(
+        self, file: Path, agent_file: Path, layout: _Layout, environment: Path | None, joint_order: tuple[str, ...]
+    ) -> None:
+        from skrl.utils.runner.torch import Runner
+
+        from rlservo.export.sources.isaac_actions import process_actions
+
+        with _quiet():
+            config = Runner.load_cfg_from_yaml(str(agent_file))
+        if not config:
+            raise CheckpointError(f"{agent_file} cannot be read by skrl: expected plain YAML")
+        config["agent"] = {name: value for name, value in config["agent"].items() if not _explores(name)}
+        self._agent = _agent(file, config, layout)
+        self._role, self._choices = layout.role, layout.choices
+        self._process = process_actions(environment, joint_order, None)
+
+    def __call__(self, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
+        actions, outputs = self._agent.act(obs, None, timestep=0, timesteps=1)
+        if self._choices is None:
+            return self._process(outputs.get("mean_actions", actions)), state
+        model = self._agent.models[self._role]
+        if self._choices != "q_values":
+            return model.distribution(role=self._role).logits, state
+        scaler = self._agent.checkpoint_modules.get("observation_preprocessor")
+        scaled = obs if scaler is None else scaler(obs)
+        values = model.act({"observations": scaled, "states": None}, role=self._role)[0]
+        if not (values.argmax(-1, keepdim=True) == actions).all():
+            raise UnsupportedError("its agent does not act by its largest Q-value")
+        return values, state
+
+
+def _explores(setting: str) -> bool:
+    return setting.startswith("exploration_") or setting == "random_timesteps"
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """What agent.yaml and the weights say of the model that acts."""
+
+    role: str
+    """Its name among the agent's models: `policy`, or `q_network`."""
+    observed: int
+    states: int | None
+    """Number of elements of the state that only a value function sees; None if there is none."""
+    actions: int
+    """Number of elements of an action, or of its choices."""
+    choices: str | None
+    """What the model gives for each choice: q_values, probabilities or log_probabilities; None if it gives a Box."""
+
+
+def _layout(file: Path, agent_file: Path, config: Mapping[str, Any], weights: Mapping[str, Any]) -> _Layout:
+    from rlservo.export.sources.isaac_env import section
+
+    algorithm = str(section(config, "agent", agent_file).get("class"))
+    if algorithm.lower().endswith("_rnn"):
+        raise UnsupportedError(
+            f"{file} is of a recurrent agent ({algorithm}), and agent.yaml does not describe its models: make the "
+            "agent in Python and export it with rlservo.export_policy, as examples/skrl_recurrent.py does"
+        )
+    role = next((role for role in ("policy", "q_network") if isinstance(weights.get(role), Mapping)), None)
+    if role is None:
+        raise UnsupportedError(f"{file} holds no weights of a 'policy' or 'q_network': it holds "
+                               f"{', '.join(sorted(map(str, weights))[:5])}")  # fmt: skip
+    models = section(config, "models", agent_file)
+    model = section(models, role, agent_file)
+    kind = str(model.get("class", ""))
     if not kind.startswith(("Gaussian", "Deterministic", "Categorical")):
-        raise UnsupportedError(f"{file}: its policy is a {kind or 'model without a class'}: GaussianMixin, "
+        raise UnsupportedError(f"{file}: its {role} is a {kind or 'model without a class'}: GaussianMixin, "
                                "DeterministicMixin and CategoricalMixin are exported")  # fmt: skip
-    if of_policy.get("clip_mean_actions") or (of_policy.get("clip_actions") and kind.startswith("Deterministic")):
+    if model.get("clip_mean_actions") or (model.get("clip_actions") and kind.startswith("Deterministic")):
         raise UnsupportedError(f"{file}: its policy clips to the action space, whose bounds are in no file of the run: "
                                "give the model to rlservo.export_policy")  # fmt: skip
-    matrices = [weight for weight in weights["policy"].values() if getattr(weight, "ndim", 0) == 2]
-    if not matrices:
-        raise UnsupportedError(f"{file}: its policy has no linear layer: the sizes of its observations are unknown")
-    size = _scaled(weights, "observation_preprocessor") or int(matrices[0].shape[1])
-    state = _scaled(weights, "state_preprocessor")
-    log_std = weights["policy"].get("log_std_parameter")
-    actions = int(log_std.shape[0]) if log_std is not None else int(matrices[-1].shape[0])
+    log_std = weights[role].get("log_std_parameter")
     if not models.get("separate", True) and log_std is None:
         raise UnsupportedError(f"{file}: a shared model does not give its number of actions")
-    # Only sampled actions are clipped to these bounds, which acting without exploration does not give.
-    action_space = Discrete(actions) if kind.startswith("Categorical") else Box(-1e30, 1e30, (actions,), np.float32)
-    return _unbounded(size), _unbounded(state) if state else None, action_space
+    matrices = [weight for weight in weights[role].values() if getattr(weight, "ndim", 0) == 2]
+    if not matrices:
+        raise UnsupportedError(f"{file}: its {role} has no linear layer: the sizes of its actions are unknown")
+    actions = int(matrices[-1].shape[0]) if getattr(log_std, "ndim", 0) != 1 else int(log_std.shape[0])
+    choices = "q_values" if role == "q_network" else None
+    if kind.startswith("Categorical"):
+        choices = "log_probabilities" if model.get("unnormalized_log_prob", True) else "probabilities"
+    states = _scaled(weights, "state_preprocessor")
+    return _Layout(role, _observed(file, model, weights, role), states, actions, choices)
+
+
+def _observed(file: Path, model: Mapping[str, Any], weights: Mapping[str, Any], role: str) -> int:
+    """Return the number of elements of an observation: those that are scaled, or that a network takes whole."""
+    if scaled := _scaled(weights, "observation_preprocessor"):
+        return scaled
+    networks = model.get("network")
+    for network in networks if isinstance(networks, list) else []:
+        if isinstance(network, Mapping) and str(network.get("input")).strip() == "OBSERVATIONS":
+            prefix = f"{network.get('name')}_container."
+            first: Any = next((weight for name, weight in weights[role].items() if str(name).startswith(prefix)), None)
+            if getattr(first, "ndim", 0) == 2:
+                return int(first.shape[1])
+    raise UnsupportedError(
+        f"{file}: no network of its {role} takes all of OBSERVATIONS, and no preprocessor scales them: the number of "
+        "elements of an observation is in no file of the run; give the model to rlservo.export_policy"
+    )
 
 
 def _unbounded(size: int) -> Box:
@@ -186,21 +261,24 @@ def _unbounded(size: int) -> Box:
 
 def _scaled(weights: Mapping[str, Any], name: str) -> int | None:
     """Return the number of elements that a preprocessor scales."""
-    mean = (weights.get(name) or {}).get("running_mean")
-    return None if mean is None else int(mean.shape[0])
+    module = weights.get(name)
+    mean: Any = module.get("running_mean") if isinstance(module, Mapping) else None
+    return int(mean.shape[0]) if getattr(mean, "ndim", 0) == 1 else None
 
 
-def _agent(file: Path, config: Mapping[str, Any], spaces: tuple[Any, Any, Any]) -> Any:
+def _agent(file: Path, config: Mapping[str, Any], layout: _Layout) -> Any:
     """Return the agent that skrl's runner makes of agent.yaml, with the weights of `file`, which are only numbers."""
-    observation_space, state_space, action_space = spaces
+    # Only sampled actions are clipped to these bounds, which acting without exploration does not give.
+    action_space = Box(-1e30, 1e30, (layout.actions,), np.float32)
     env: Any = SimpleNamespace(
-        device="cpu", num_envs=1, num_agents=1, observation_space=observation_space, state_space=state_space,
-        action_space=action_space,
+        device="cpu", num_envs=1, num_agents=1, observation_space=_unbounded(layout.observed),
+        state_space=_unbounded(layout.states) if layout.states else None,
+        action_space=action_space if layout.choices is None else Discrete(layout.actions),
     )  # fmt: skip
     from skrl.utils.runner.torch import Runner
 
-    trainer = {**(config.get("trainer") or {}), "close_environment_at_exit": False}
     try:
+        trainer = {**(config.get("trainer") or {}), "close_environment_at_exit": False}
         with _quiet():
             agent = Runner(env, {**config, "seed": 0, "trainer": trainer}).agent
             agent.load(str(file))

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import abc
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Protocol, TypeAlias
 
+from rlservo.errors import CheckpointError
 from rlservo.export.checkpoints.facts import CheckpointFacts
-from rlservo.export.contract.errors import CheckpointError
 
 if TYPE_CHECKING:
     from rlservo.export.sources.restored_policy import RestoredPolicy
@@ -28,16 +28,24 @@ PICKLES = "checkpoints are pickles and run code when loaded; export only those y
 
 @dataclass(frozen=True)
 class RestoreOptions:
-    """Options of one export that a source may need; it ignores those that do not concern it."""
+    """Options of one export that a source may need; those that its `options` do not name keep their defaults."""
 
     app_dir: Path
     """The folder of the user's own modules, which is on the import path."""
     value: bool = True
     """False leaves the value head out."""
     vecnormalize: Path | None = None
-    """Stable-Baselines3's observation statistics, if they are not beside the model."""
+    """Stable-Baselines3's observation statistics, if they are not beside the model; `none` for a model without."""
     frame_stack: int = 1
     """Number of frames that Stable-Baselines3's VecFrameStack put into one observation."""
+    joint_order: tuple[str, ...] = ()
+    """The robot's joints in its own order, for an Isaac Lab or mjlab environment that does not describe them."""
+    control_rate_hz: float | None = None
+    """The control rate [Hz], if no file has it."""
+    action_range: tuple[float, float] | None = None
+    """Bounds that every element of a given ONNX's action is clipped to."""
+    outputs: Mapping[str, str] = field(default_factory=dict)
+    """Of a given ONNX's outputs: `action`, `none`, or the input that gets it at the next step."""
 
 
 class PolicyFiles(Protocol):
@@ -103,6 +111,8 @@ class Source(abc.ABC):
     """Description of this source's paths, for the message about a path that no source recognises."""
     reference: ClassVar[str]
     """The parity gate's reference."""
+    options: ClassVar[tuple[str, ...]] = ()
+    """The options of `rlservo export` that it takes of those that not every source does, such as `--joint-order`."""
 
     @abc.abstractmethod
     def detects(self, path: Path) -> bool:

@@ -13,11 +13,11 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
 from numpy.typing import NDArray
 
+from rlservo.bundle.scores import Q_VALUES
+from rlservo.errors import UnsupportedError, UsageError
 from rlservo.export.checkpoints.facts import CheckpointFacts
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.scores import Q_VALUES
 from rlservo.export.recipe.recipe import Affine, Mode, Recipe, StateLeaf
-from rlservo.export.recipe.trees import space_leaves
+from rlservo.export.recipe.trees import map_tree, space_leaves
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source
 
 if TYPE_CHECKING:
@@ -92,10 +92,11 @@ class TorchModule(Source):
         return self._spec.facts
 
     def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:  # noqa: ARG002
-        from rlservo.export.sources.torch_policy import TorchPolicy, restored, second
+        from rlservo.export.sources.torch_policy import TorchPolicy, notify_mode, restored, second
 
         assert isinstance(files, ModuleFiles)
         spec, what = self._spec, type(files.module).__name__
+        _check_module(files.module)
         _check_spaces(spec)
         traced, acting = (second(files.module, what).cpu().eval() for _ in range(2))
         mode: Mode = "given" if isinstance(spec.action_space, Box) else "argmax"
@@ -110,8 +111,13 @@ class TorchModule(Source):
             affine=_affine(spec),
         )
         names = () if mode == "given" else (Q_VALUES,)
-        policy = TorchPolicy(recipe, traced, partial(_act, spec), lambda: partial(_act, spec, acting), names)
-        return restored(policy, spec.elements, what)
+        policy = TorchPolicy(
+            recipe, traced, partial(_act, spec), lambda: partial(_act_single, spec, acting), names, partial(_send, spec)
+        )
+        made = restored(policy, spec.elements, what)
+        if any(part.training for part in files.module.modules()):
+            notify_mode(policy, second(files.module, what).cpu(), notify)
+        return made
 
 
 def _act(spec: ModuleSpec, module: nn.Module, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
@@ -121,6 +127,20 @@ def _act(spec: ModuleSpec, module: nn.Module, obs: Any, state: list[Tensor]) -> 
     if len(after) != len(spec.state):
         raise ValueError(f"it gives {len(after)} tensors of state, {len(spec.state)} were named ({list(spec.state)})")
     return first, after
+
+
+def _act_single(spec: ModuleSpec, module: nn.Module, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
+    """Return what the module gives for an environment's observation, its floating-point numbers in single precision."""
+    return _act(spec, module, map_tree(lambda leaf: leaf.float() if leaf.is_floating_point() else leaf, obs), state)
+
+
+def _send(spec: ModuleSpec, action: NDArray[Any]) -> NDArray[Any]:
+    """Return `action * scale + offset`, clipped, by the user's own numbers."""
+    if spec.scale is not None:
+        action = action * np.asarray(spec.scale, np.float32)
+    if spec.offset is not None:
+        action = action + np.asarray(spec.offset, np.float32)
+    return np.asarray(np.clip(action, spec.action_space.low, spec.action_space.high) if spec.clip else action)
 
 
 def _affine(spec: ModuleSpec) -> Affine | None:
@@ -143,6 +163,25 @@ def _affine(spec: ModuleSpec) -> Affine | None:
     return Affine(sides[0], sides[1])
 
 
+def _check_module(module: Any) -> None:
+    """Raise an error for what is not a torch module that can be traced."""
+    import torch
+
+    if not isinstance(module, torch.nn.Module):
+        raise UsageError(f"a {type(module).__name__} is not a torch module: expected a torch.nn.Module")
+    if any(isinstance(part, torch.jit.ScriptModule) for part in module.modules()):
+        raise UnsupportedError(
+            f"{type(module).__name__} is or holds a TorchScript module, which is not exported again: give the "
+            "torch.nn.Module that it was scripted or traced from"
+        )
+    for name, weights in module.state_dict().items():
+        if not isinstance(weights, torch.Tensor) or weights.is_quantized:
+            raise UnsupportedError(
+                f"{type(module).__name__}: '{name}' is of a quantized layer, which is not exported: give the module as "
+                "it was before"
+            )
+
+
 def _check_spaces(spec: ModuleSpec) -> None:
     """Raise UsageError for spaces or names that no bundle has."""
     if not isinstance(spec.observation_space, Box | Discrete | MultiDiscrete | MultiBinary | Dict | Tuple):
@@ -150,6 +189,14 @@ def _check_spaces(spec: ModuleSpec) -> None:
     if not isinstance(spec.action_space, ACTIONS):
         raise UsageError(f"the action space {spec.action_space!r} is not exported: expected a Box, Discrete or "
                          "MultiDiscrete")  # fmt: skip
+    if isinstance(spec.action_space, MultiDiscrete) and spec.action_space.nvec.ndim != 1:
+        raise UsageError(f"the action space {spec.action_space} is not exported: only one-dimensional ones are")
+    starts = np.asarray(getattr(spec.action_space, "start", 0))
+    if (starts != 0).any():
+        raise UsageError(
+            f"the action space {spec.action_space} does not start at 0: the module's scores choose from 0 on; give the "
+            "space without its start, and add it to the action"
+        )
     for name, space in (*space_leaves(spec.observation_space, "obs").items(), ("action", spec.action_space)):
         if isinstance(space, Box) and np.dtype(space.dtype).kind == "f" and space.dtype not in (np.float32, np.float64):
             raise UsageError(f"{name}: {space} is not exported: of floating-point spaces only float32 and float64 are")

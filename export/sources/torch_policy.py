@@ -12,15 +12,18 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
+from rlservo.errors import CheckpointError, UnsupportedError, first_line
+from rlservo.export.recipe.kept_values import changed, kept_values
 from rlservo.export.recipe.recipe import Recipe, parameter_count
 from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.samples import draw_pair
-from rlservo.export.recipe.trees import Tree, build, tree_leaves
+from rlservo.export.recipe.trees import Tree, build_in_order, map_tree, tree_leaves
 from rlservo.export.sources.restored_policy import ElementNames, RestoredPolicy, diverged_weights
+from rlservo.export.sources.source import Notify
 
 
 class Act(Protocol):
@@ -43,6 +46,8 @@ class TorchPolicy:
     """Start the framework's own way to act, for observations as the environment gives them, as torch tensors."""
     names: tuple[str, ...] = ()
     """`("q_values",)` or `("action_dist_inputs",)` if the output is scores."""
+    send: Callable[[NDArray[Any]], NDArray[Any]] | None = None
+    """The reference's own step from its Box action to the environment's; None: it gives the environment's."""
 
 
 def restored(
@@ -124,7 +129,7 @@ class ActLoop:
     def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
         """Return the framework's outputs for one step of every row, by name."""
         recipe = self._policy.recipe
-        leaves = [torch.from_numpy(inputs[name]) for name in recipe.observation_leaves]
+        leaves = {name: torch.from_numpy(values) for name, values in inputs.items()}
         begins = torch.from_numpy(restart)
         state = []
         for number, leaf in enumerate(recipe.network_state):
@@ -132,7 +137,14 @@ class ActLoop:
             last = self._state[number] if self._state else start
             state.append(torch.where(begins.reshape(-1, *[1] * leaf.initial.ndim), start, last))
         with torch.no_grad():
-            output, self._state = self._act(build(recipe.observation_space, leaves), state)
+            output, self._state = self._act(build_in_order(recipe.observation_space, leaves), state)
+        for leaf, after in zip(recipe.network_state, self._state, strict=True):
+            wanted = ((len(restart), *leaf.initial.shape), torch.from_numpy(leaf.initial).dtype)
+            if (tuple(after.shape), after.dtype) != wanted:
+                raise UnsupportedError(
+                    f"for {len(restart)} observations it gives the state '{leaf.name}' as {after.dtype} of shape "
+                    f"{tuple(after.shape)}, expected {wanted[1]} of shape {wanted[0]}"
+                )
         values = [leaf.numpy().copy() for leaf in tree_leaves(output)]
         _check_shape(recipe, values, len(restart))
         outputs: Outputs = {}
@@ -140,12 +152,9 @@ class ActLoop:
             outputs[self._policy.names[0]] = values[0]
             values = [_choose(recipe, values[0])]
         for (name, space), value in zip(recipe.action_leaves.items(), values, strict=True):
-            if np.dtype(space.dtype).kind in "iu":
-                outputs[name] = value.astype(np.int64)
-                continue
-            sent = value if recipe.affine is None else recipe.affine.apply(value)
-            outputs[name] = np.clip(sent, space.low, space.high) if recipe.transform == "clip" else sent
-            outputs[name] = outputs[name].astype(space.dtype)
+            send = self._policy.send if isinstance(space, Box) else None
+            sent = value if send is None else send(value)
+            outputs[name] = sent.astype(np.int64 if np.dtype(space.dtype).kind in "iu" else space.dtype)
         for leaf, tensor in zip(recipe.network_state, self._state, strict=True):
             outputs[f"state_out.{leaf.name}"] = tensor.numpy().copy()
         return outputs
@@ -163,6 +172,27 @@ def _choose(recipe: Recipe, scores: NDArray[Any]) -> NDArray[Any]:
 def second(module: nn.Module, what: str) -> nn.Module:
     """Return a copy of a module, so that what is traced and what acts as the reference share nothing."""
     try:
-        return copy.deepcopy(module)
+        copied = copy.deepcopy(module)
     except Exception as error:
         raise UnsupportedError(f"{what}: {type(module).__name__} cannot be copied: {first_line(error)}") from error
+    if kept := changed(dict(kept_values(module)), dict(kept_values(copied))).removeprefix("."):
+        raise UnsupportedError(
+            f"{what}: a copy of the {type(module).__name__} has another '{kept}' than itself, and copies are what is "
+            "exported and proven: correct its __deepcopy__ or __getstate__"
+        )
+    return copied
+
+
+def notify_mode(policy: TorchPolicy, module: nn.Module, notify: Notify) -> None:
+    """Say that a module is in training mode, if it acts otherwise in it than the policy's own in evaluation mode."""
+    recipe, pair = policy.recipe, draw_pair(policy.recipe)
+    obs = build_in_order(recipe.observation_space, {name: torch.from_numpy(leaf) for name, leaf in pair.items()})
+    obs = map_tree(lambda leaf: leaf.float() if leaf.is_floating_point() else leaf, obs)
+    state = [torch.from_numpy(leaf.initial).expand(2, *leaf.initial.shape) for leaf in recipe.network_state]
+    with torch.random.fork_rng(devices=()), torch.no_grad():
+        training, evaluating = (tree_leaves(policy.act(one, obs, state)[0]) for one in (module, policy.module))
+    if not all(torch.equal(*pair) for pair in zip(training, evaluating, strict=True)):
+        notify(
+            f"the {type(module).__name__} is in training mode, in which it acts otherwise (dropout, batch "
+            "normalization): it is exported in evaluation mode"
+        )

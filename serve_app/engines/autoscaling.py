@@ -19,7 +19,7 @@ TARGET = 0.6  # share of one core per replica; above it, simultaneous requests n
 ENOUGH = 0.45  # one replica less only if the others stay below this, to avoid oscillation
 
 
-class Load:
+class ThreadLoad:
     """Share of the time in which this process's busiest thread wanted a core, whether it got one or not.
 
     Processor time looks modest exactly when the machine is overloaded.

@@ -10,19 +10,21 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from collections import Counter
 from collections.abc import Awaitable
-from typing import Any
+from typing import Any, NoReturn
 
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from rlservo.export.contract.errors import DeadlineError, OverloadedError, RequestError, RlservoError
-from rlservo.serve_app.episodes.request import Request
+from rlservo.errors import DeadlineError, OverloadedError, RequestError, RlservoError
 from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, error_answer, send_reply
 from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.sessions.request import Request
 
 HANDLER = "rlservo.handler"  # in the application's lifespan state, which uvicorn hands to each connection
+ADDRESSES = "rlservo.addresses"  # likewise
 HEAD_S = 5.0  # [s] for a request's head, from the connection's start or the head's first byte
 MAX_HEAD_BYTES = 16384  # of a head, or of trailers
 MAX_PIPELINED = 32  # requests that a connection may send before the first one is answered
@@ -41,20 +43,66 @@ class _Refused(Exception):
     """A request is refused in a callback of the parser; httptools and uvicorn answer 400 for any exception in one."""
 
 
+class _Addresses:
+    """Open connections of one process by client address, from their start as HTTP; some end as WebSockets."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._of: dict[asyncio.BaseTransport, str] = {}
+
+    @classmethod
+    def of(cls, app_state: dict[str, Any]) -> _Addresses:
+        """Return those of a process, given its lifespan state."""
+        addresses: _Addresses = app_state.setdefault(ADDRESSES, cls())
+        return addresses
+
+    def add(self, transport: asyncio.BaseTransport, address: str) -> None:
+        self._of[transport] = address
+        self.counts[address] += 1
+
+    def remove(self, transport: asyncio.BaseTransport) -> None:
+        address = self._of.pop(transport, None)
+        if address is not None:
+            self.counts[address] -= 1
+            if not self.counts[address]:
+                del self.counts[address]
+
+
+class _JoinedWrites(asyncio.Transport):
+    """A connection's transport for one reply, whose head it writes together with the beginning of the body.
+
+    uvicorn writes them separately: the client, woken by the head, would take the processor before the body is sent.
+    """
+
+    def __init__(self, transport: asyncio.Transport) -> None:
+        self._transport, self._head = transport, b""
+        self.is_closing, self.close = transport.is_closing, transport.close  # type: ignore[method-assign]
+
+    def write(self, data: bytes | bytearray | memoryview) -> None:
+        """Keep the first piece for the second."""
+        if self._head:
+            self._transport.write(self._head + data)
+            self.write = self._transport.write  # type: ignore[method-assign]
+        else:
+            self._head = bytes(data)
+
+
 class BoundedHttp(HttpToolsProtocol):
     """A connection that ends when a client sends too much or takes too long."""
 
     _phase_limit_s: float | None = HEAD_S  # [s] None while nothing is awaited from the client
     _is_late = False  # whether the phase was beyond its limit at the last check
     _in_body = False
-    _head_bytes = 0
-    _trailer_bytes = 0
-    _sentence = ""
+    _field_bytes = 0  # of the complete fields of a head or of trailers
+    _unparsed_bytes = 0  # of whole reads without a byte of a body: of a head, trailers or a chunk's first line
+    _refusal = ("the request is not valid HTTP/1.1", 400)
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Count the connection, and begin to wait for the first head."""
         super().connection_made(transport)
         self._handler: RequestHandler = self.app_state[HANDLER]
+        if self.client is not None:
+            _Addresses.of(self.app_state).add(transport, self.client[0])
         self._since = self.loop.time()
         connection = transport.get_extra_info("socket")
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # the kernel closes it if a reply stays unread, also on a WebSocket
@@ -68,20 +116,23 @@ class BoundedHttp(HttpToolsProtocol):
 
     def _excess(self) -> int:
         """Return the number of connections by which this address, or the process, exceeds its bound."""
-        total, most = len(self.connections), self._handler.settings.max_connections_per_address
-        own = 0
-        if most and self.client is not None and total > most:
-            peers: Any = self.connections
-            own = sum(1 for peer in peers if peer.client is not None and peer.client[0] == self.client[0])
-        return max(own - most, total - MAX_CONNECTIONS)
+        most = self._handler.settings.max_connections_per_address
+        own = _Addresses.of(self.app_state).counts[self.client[0]] if most and self.client is not None else 0
+        return max(own - most, len(self.connections) - MAX_CONNECTIONS)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Count the connection no longer."""
+        super().connection_lost(exc)
+        _Addresses.of(self.app_state).remove(self.transport)
 
     def data_received(self, data: bytes) -> None:
-        """Read the data; of a head, no more than is allowed."""
+        """Read the data; of a head or trailers, no more than is allowed: the parser keeps a field until it ends."""
+        self._unparsed_bytes += len(data)
         super().data_received(data)
-        if not self._in_body and self._phase_limit_s is not None:
-            self._head_bytes += len(data)
-            if self._head_bytes > MAX_HEAD_BYTES and not self.transport.is_closing():
-                self._end(RequestError(f"the request's headers are larger than {MAX_HEAD_BYTES} bytes"), 431)
+        is_awaited = self._phase_limit_s is not None and not self.transport.is_closing()
+        if is_awaited and self._unparsed_bytes > MAX_HEAD_BYTES:
+            sentence, status = self._fields_too_large()
+            self._end(RequestError(sentence), status)
 
     # Callbacks of the parser
 
@@ -89,16 +140,15 @@ class BoundedHttp(HttpToolsProtocol):
         """Start to wait for a head."""
         super().on_message_begin()
         self._await(HEAD_S)
-        self._head_bytes = 0
+        self._field_bytes = 0
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Take a header. After the body it is a trailer, which is ignored and bounded."""
+        """Take a header. After the body it is a trailer, which is ignored. Both are bounded."""
+        self._field_bytes += len(name) + len(value)
+        if self._field_bytes > MAX_HEAD_BYTES:
+            self._refuse(*self._fields_too_large())
         if not self._in_body:
             super().on_header(name, value)
-            return
-        self._trailer_bytes += len(name) + len(value)
-        if self._trailer_bytes > MAX_HEAD_BYTES:
-            self._refuse("the request's trailers are too large")
 
     def on_headers_complete(self) -> None:
         """Start to wait for the body."""
@@ -108,19 +158,29 @@ class BoundedHttp(HttpToolsProtocol):
         if len(self.pipeline) >= MAX_PIPELINED:
             self._refuse(f"more than {MAX_PIPELINED} requests were sent before the first one was answered")
         self._in_body = True
-        self._trailer_bytes = 0
+        self._field_bytes = self._unparsed_bytes = 0
         self._await(self._handler.settings.body_timeout_s)
+        before = self.cycle
         super().on_headers_complete()
+        if self.cycle is not before and self.scope["method"] != "HEAD" and not self.expect_100_continue:
+            self.cycle.transport = _JoinedWrites(self.transport)
+
+    def on_body(self, body: bytes) -> None:
+        """Take a part of the body, which is bounded elsewhere."""
+        self._unparsed_bytes = 0
+        super().on_body(body)
 
     def on_message_complete(self) -> None:
         """Await nothing more of this request."""
         super().on_message_complete()
         self._in_body = False
+        self._unparsed_bytes = 0
         self._await(None)
 
     def send_400_response(self, msg: str) -> None:  # noqa: ARG002
         """Answer a request that the parser or one of its callbacks refused, and close."""
-        self._end(RequestError(self._sentence or "the request is not valid HTTP/1.1"))
+        sentence, status = self._refusal
+        self._end(RequestError(sentence), status)
 
     # Ours
 
@@ -148,8 +208,12 @@ class BoundedHttp(HttpToolsProtocol):
         if not is_websocket or has_body:
             self._refuse("the header Upgrade is supported only for a WebSocket, which begins with a GET without a body")
 
-    def _refuse(self, sentence: str) -> None:
-        self._sentence = sentence
+    def _fields_too_large(self) -> tuple[str, int]:
+        fields, status = ("trailers", 400) if self._in_body else ("headers", 431)
+        return f"the request's {fields} are larger than {MAX_HEAD_BYTES} bytes", status
+
+    def _refuse(self, sentence: str, status: int = 400) -> NoReturn:
+        self._refusal = sentence, status
         raise _Refused
 
     def _end(self, error: RlservoError, other_status: int | None = None) -> None:
@@ -183,6 +247,11 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
     _frames = 0
     _second = 0.0
     _is_refused = False
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Count the connection, which began as HTTP, no longer."""
+        super().connection_lost(exc)
+        _Addresses.of(self.app_state).remove(self.transport)
 
     def data_received(self, data: bytes) -> None:
         """Read the data, as long as the client keeps to the bounds."""

@@ -10,11 +10,11 @@ from typing import Any
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.client.formats.addresses import is_loopback
+from rlservo.errors import UnavailableError
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
-from rlservo.serve_app.protocols.open_inference.messages import SERVICE, STREAM, UNARY
+from rlservo.serve_app.protocols.open_inference.oip_messages import SERVICE, STREAM, UNARY
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.wire.addresses import is_loopback
 
 LONGEST_S = 86400.0  # [s] gRPC expresses "no deadline" as one far away
 DRAIN_S = 5.0

@@ -9,7 +9,7 @@ from typing import Any
 
 import psutil
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 
 BACKLOG = 2048
 

@@ -11,7 +11,9 @@ import asyncio
 import contextlib
 import logging
 import os
+import sys
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any, cast
 
 import grpc
@@ -20,18 +22,19 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from ray import serve
 from ray.serve import Application, Deployment
 
-from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.engines.autoscaling import BUSY, Load
+from rlservo.client.formats.addresses import is_loopback
+from rlservo.errors import RlservoError
+from rlservo.serve_app.engines.autoscaling import BUSY, ThreadLoad
 from rlservo.serve_app.engines.server_process import running
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
-from rlservo.serve_app.protocols.open_inference.messages import SERVICE, STREAM, UNARY
-from rlservo.serve_app.repository.storage import place_of
+from rlservo.serve_app.protocols.open_inference.oip_messages import SERVICE, STREAM, UNARY
+from rlservo.serve_app.repository.places import place_of
 from rlservo.serve_app.server.api_keys import check_exposure
 from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import plan_follower
-from rlservo.serve_app.wire.addresses import is_loopback
+from rlservo.serve_app.versions.computing import left_by_dead, write_to
 
 logger = logging.getLogger(__name__)
 
@@ -118,11 +121,14 @@ class PolicyServer(InferenceMethods):
     def __init__(self, places: list[str], settings: dict[str, Any]) -> None:
         """Check the settings. Serve calls `reconfigure` next, and sends requests only after that."""
         self._settings = ServerSettings(**settings)
-        self._load = Load()
+        self._load = ThreadLoad()
         replica = serve.get_replica_context().replica_tag
         host = _listening_host()
         try:
-            configure(self._settings, replica=replica)
+            # Serve may have replaced `sys.stderr` by a logger that drops what is written there.
+            with contextlib.redirect_stderr(sys.__stderr__):
+                configure(self._settings, replica=replica)
+            _log_deaths()
             check_exposure(host, self._settings)
             self._control = plan_follower(places, self._settings)
             self._app = create_app(
@@ -176,6 +182,17 @@ class PolicyServer(InferenceMethods):
             await self._control.configure(user_config)
         except Exception:
             logger.exception("the configuration cannot be read; still serving the previous one")
+
+
+def _log_deaths() -> None:
+    """Log what replicas that died on this node were computing, and write down what this one computes."""
+    context = ray.get_runtime_context()
+    folder = Path(context.get_temp_dir(), context.get_session_name(), "rlservo")
+    folder.mkdir(exist_ok=True)
+    for pid, computing in left_by_dead(folder).items():
+        if computing:  # otherwise it may have been stopped
+            logger.error("a replica (process %d) died while computing %s", pid, " and ".join(computing))
+    write_to(folder)
 
 
 def add_service(_servicer: Any, server: Any) -> None:

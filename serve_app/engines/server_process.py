@@ -5,16 +5,19 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import itertools
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
 from typing import Any
 
-from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.server import current_keys, metrics
+from rlservo.errors import RlservoError
+from rlservo.serve_app.server import current_keys, exposition, metrics
 from rlservo.serve_app.server.request_handler import RequestHandler
 
 logger = logging.getLogger(__name__)
+
+LOOK_S = 30.0  # [s] between looks for bundles that are not served
 
 
 @contextlib.asynccontextmanager
@@ -26,12 +29,12 @@ async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
     control, settings = handler.control, handler.settings
     await control.configure(served)
     handler.admission.start_clock()
-    sample = partial(metrics.sample, handler) if handler.metrics.folder is not None else None
+    sample = partial(exposition.sample, handler) if handler.metrics.folder is not None else None
     if sample is not None:  # for the other workers to read
         await sample()
     background = [
         repeat(control.files.poll_s, control.follow, "the plan cannot be followed"),
-        control.warn_of_newer(),  # beside the other: the plan is followed even if the look hangs
+        repeat(LOOK_S, control.look, "looking for bundles that are not served", at_once=True),
     ]
     if settings.poll_s is not None:
         background.append(repeat(settings.poll_s, control.load_newer, "looking for new versions failed"))
@@ -51,11 +54,13 @@ async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-async def repeat(period_s: float, step: Callable[[], Awaitable[set[str] | None]], fault: str) -> None:
+async def repeat(
+    period_s: float, step: Callable[[], Awaitable[set[str] | None]], fault: str, *, at_once: bool = False
+) -> None:
     """Repeat a step until cancelled; log what it returns or raises, each sentence once until it is gone."""
     logged: set[str] = set()
-    while True:
-        await asyncio.sleep(period_s)
+    for number in itertools.count():
+        await asyncio.sleep(0.0 if at_once and number == 0 else period_s)
         bug = None
         try:
             wrong = await step() or set()

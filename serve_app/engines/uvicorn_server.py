@@ -16,6 +16,7 @@ import shutil
 import signal
 import socket
 import threading
+import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,9 @@ import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.supervisors import Multiprocess
 
-from rlservo.export.contract.errors import RlservoError, UnavailableError, UsageError
+from rlservo.client.formats.addresses import is_loopback
+from rlservo.client.formats.admin_key_file import remove_key, written_key
+from rlservo.errors import RlservoError, UnavailableError, UsageError
 from rlservo.serve_app.engines.connection_bounds import (
     HANDLER,
     MAX_CONNECTIONS,
@@ -36,16 +39,15 @@ from rlservo.serve_app.engines.connection_bounds import (
 from rlservo.serve_app.engines.ports import BACKLOG, listen
 from rlservo.serve_app.engines.server_process import running
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.repository.storage import place_of
+from rlservo.serve_app.repository.places import place_of
 from rlservo.serve_app.server.api_keys import Role, check_exposure, new_key
 from rlservo.serve_app.server.logs import configure
 from rlservo.serve_app.server.metrics import FOLDER_VARIABLE, shared_by_workers
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.server.start_check import load_served, plan_follower
-from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import ServedConfig
-from rlservo.serve_app.wire.addresses import is_loopback
-from rlservo.serve_app.wire.admin_key_file import written_key
+from rlservo.serve_app.server.start_check import checked_start, not_served, plan_follower
+from rlservo.serve_app.versions.computing import left_by_dead, write_to
+from rlservo.serve_app.versions.deployment_plan import ServedConfig
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +68,7 @@ class RunningServer:
     policies: tuple[tuple[str, str], ...]  # (name, default version)
     grpc: str | None = None  # host:port, if gRPC is served
     admin_key_file: Path | None = None  # the operator's key, for as long as the server runs
+    not_served: tuple[str, ...] = ()  # a sentence for each bundle that the plan leaves out
 
 
 def serve_policies(
@@ -97,7 +100,9 @@ def serve_policies(
         raise UsageError(f"workers must be 1 or more, got {workers}")
     in_main = threading.current_thread() is threading.main_thread()
     if workers > 1 and not in_main:
-        raise UsageError("several workers must be started from the main thread, whose signals their supervisor handles")
+        raise UsageError(
+            "several workers must be started from the main thread: only there can their supervisor handle signals"
+        )
     chosen = ServerSettings.from_environment(settings)
     ServedConfig.parse(dict(served or {}))
     keys = check_exposure(host, chosen)
@@ -119,16 +124,22 @@ def serve_policies(
         else:
             admin_key_file = None
         server = EmbeddedServer(
-            tuple(place_of(place) for place in places), host, grpc_port, workers, chosen, dict(served or {})
+            tuple(place_of(place) for place in places),
+            host,
+            grpc_port,
+            workers,
+            chosen,
+            dict(served or {}),
+            admin_key_file,
         )
         shown = "127.0.0.1" if host == "0.0.0.0" else "[::1]" if host == "::" else f"[{host}]" if ":" in host else host
         url = f"http://{shown}:{listener.getsockname()[1]}"
         grpc = None if grpc_port is None else f"{shown}:{grpc_port}"
 
-        def ready(store: PolicyStore) -> None:
+        def ready(store: PolicyStore, left_out: Sequence[str]) -> None:
             policies = tuple((name, store.default(name)) for name in store.names)
             if on_ready is not None:
-                on_ready(RunningServer(url, policies, grpc, admin_key_file))
+                on_ready(RunningServer(url, policies, grpc, admin_key_file, tuple(left_out)))
 
         if workers > 1:
             _run_workers(server, listener, ready, stopping)
@@ -158,7 +169,9 @@ class EmbeddedServer:
     workers: int
     settings: ServerSettings
     served: dict[str, Any]
-    on_ready: Callable[[PolicyStore], None] | None = None
+    admin_key_file: Path | None = None
+    """The operator's key, whose file workers remove if their supervisor has died."""
+    on_ready: Callable[[PolicyStore, Sequence[str]], None] | None = None
     """Called when the policies are loaded: connections to the socket, which listens already, are answered."""
     failure: Exception | None = None
     """Reason why the start failed, in the process that serves."""
@@ -189,9 +202,11 @@ class EmbeddedServer:
         replica = str(os.getpid()) if is_worker else ""
         if is_worker:
             configure(settings, replica=replica)
-            _stop_with_parent()
+            _stop_with_parent(self.admin_key_file, settings.operator_key)
+            write_to(Path(os.environ[FOLDER_VARIABLE]))
         control = plan_follower(self.places, settings)
         app = create_app(control, settings, replica=replica, host=self.host, is_alone=not is_worker)
+        stack.callback(app.handler.metrics.leave)
         stack.push_async_callback(app.handler.close)
         await stack.enter_async_context(running(app.handler, self.served))
         store = app.handler.store()
@@ -206,9 +221,10 @@ class EmbeddedServer:
             await grpc.start()
             stack.push_async_callback(grpc.stop)
         state[HANDLER] = app.handler
+        left_out = await not_served(control) if self.on_ready is not None else []
         self.app = app
         if self.on_ready is not None:
-            self.on_ready(store)
+            self.on_ready(store, left_out)
 
     def config(self) -> uvicorn.Config:
         """Return uvicorn's configuration."""
@@ -234,7 +250,7 @@ class EmbeddedServer:
         )
 
 
-def _stop_with_parent() -> None:
+def _stop_with_parent(key_file: Path | None, key_digest: str) -> None:
     """Stop this worker if its supervisor has died, and remove the files that it would have removed."""
     loop, parent = asyncio.get_running_loop(), multiprocessing.parent_process()
     if parent is None:
@@ -244,6 +260,8 @@ def _stop_with_parent() -> None:
         loop.remove_reader(parent.sentinel)
         if (folder := os.environ.get(FOLDER_VARIABLE)) is not None:
             shutil.rmtree(folder, ignore_errors=True)
+        if key_file is not None:
+            remove_key(key_file, key_digest)
         os.kill(os.getpid(), signal.SIGTERM)
 
     loop.add_reader(parent.sentinel, stop)
@@ -269,15 +287,16 @@ class _Server(uvicorn.Server):
 def _run_workers(
     server: EmbeddedServer,
     listener: socket.socket,
-    on_ready: Callable[[PolicyStore], None],
+    on_ready: Callable[[PolicyStore, Sequence[str]], None],
     on_stop: Callable[[], None],
 ) -> None:
     # Faults of the policies are reported here, once, before any worker starts.
-    store = load_served(server.places, server.served, server.settings)
+    store, left_out = checked_start(server.places, server.served, server.settings)
     store.close()
+    configure(server.settings)
     UVICORN.setLevel(logging.INFO)
     with _stop_signals(lambda: None), shared_by_workers():  # the first restores the supervisor's signal handlers
-        supervisor = _Supervisor(server.config(), listener, lambda: on_ready(store), on_stop)
+        supervisor = _Supervisor(server.config(), listener, lambda: on_ready(store, left_out), on_stop)
         supervisor.run()
     if not supervisor.is_asked_to_stop:
         raise UnavailableError("a worker could not start: see the lines above")
@@ -293,6 +312,8 @@ class _Supervisor(Multiprocess):
         self._on_ready: Callable[[], None] | None = on_ready
         self._on_stop = on_stop
         self.is_asked_to_stop = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._queue_stop)
 
     def run(self) -> None:
         """Supervise the workers until they are stopped, or a callback raises."""
@@ -307,7 +328,12 @@ class _Supervisor(Multiprocess):
         """Replace workers that died or hang; report once when all are ready."""
         for process in self.processes:
             process.child_conn.close()  # the worker has its own: if it dies in a health check, the wait for it ends
+        before = [(process, process.exitcode) for process in self.processes]
         super().keep_subprocess_alive()
+        left = left_by_dead(Path(os.environ[FOLDER_VARIABLE]))
+        for process, code in before:
+            if process not in self.processes and process.pid is not None:
+                _log_death(process.pid, code, process.exitcode, left.get(process.pid, []))
         if self._on_ready is not None and all(process.is_ready() for process in self.processes):
             self._on_ready()
             self._on_ready = None
@@ -321,13 +347,43 @@ class _Supervisor(Multiprocess):
 
     handle_int = handle_term
 
+    def terminate_all(self) -> None:
+        """Stop the workers, also those that are stopped (SIGSTOP), as systemd does."""
+        super().terminate_all()
+        self._continue_all()
+
     def join_all(self) -> None:
-        """Wait for the workers to exit, and kill those that do not."""
+        """Wait for the workers to exit, and kill those that do not; the time is for all together."""
+        end = time.monotonic() + EXIT_S
         for process in self.processes:
-            process.process.join(EXIT_S)
+            process.process.join(max(0.0, end - time.monotonic()))
             if process.process.exitcode is None:
                 process.process.kill()
         super().join_all()
+
+    def _queue_stop(self, number: int, _frame: FrameType | None) -> None:
+        """Queue a signal; a health check in progress would wait for a worker that is stopped."""
+        self.signal_queue.append(number)
+        self._continue_all()
+
+    def _continue_all(self) -> None:
+        for process in self.processes:
+            if process.pid is not None and process.exitcode is None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process.pid, signal.SIGCONT)
+
+
+def _log_death(pid: int, code: int | None, last_code: int | None, computing: Sequence[str]) -> None:
+    """Log the end of a worker that another replaces; `code` is its exit code before the supervisor killed it."""
+    if code is None and last_code == -signal.SIGKILL:
+        how = f"did not answer for {HUNG_S} s and was killed"
+    elif last_code is not None and last_code < 0:
+        how = f"was ended by signal {-last_code} ({signal.strsignal(-last_code)})"
+        if last_code == -signal.SIGKILL:
+            how += ", perhaps because memory ran out,"
+    else:
+        how = f"exited with code {last_code}"
+    logger.error("worker %d %s while computing %s; it is replaced", pid, how, " and ".join(computing) or "nothing")
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from rlservo.export.contract.errors import RequestError
+from rlservo.errors import RequestError
 from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
 from rlservo.serve_app.protocols.request_fields import encode_json, parse_json
@@ -21,8 +21,8 @@ from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import OK
 from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.versions.deployment_plan import Plan
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed, Command, Load, Unload, parse
-from rlservo.serve_app.versions.serving_plan import Plan
 
 MOST_BYTES = 8 << 20  # of a recording, in a reply
 
@@ -42,8 +42,9 @@ def routes(handler: RequestHandler) -> list[Route]:
         async def answer(call: Call) -> tuple[bytes, Headers]:
             check_media_type(call.headers)
             document, _ = parse_json(call.body, such_as='{"version": "2"}')
-            after = await carry_out(call, parse(command, document))
-            return Changed.of(after, call.params["name"]).model_dump_json().encode(), JSON_HEADERS
+            given = parse(command, document)
+            after = await carry_out(call, given)
+            return Changed.of(after, call.params["name"], given.notes).model_dump_json().encode(), JSON_HEADERS
 
         return answer
 

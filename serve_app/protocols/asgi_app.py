@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.types import Receive, Scope, Send
 
-from rlservo.export.contract.errors import (
+from rlservo.errors import (
     ForbiddenError,
     InternalError,
     RateLimitError,
@@ -20,8 +20,7 @@ from rlservo.export.contract.errors import (
     RlservoError,
     UnknownPolicyError,
 )
-from rlservo.serve_app.episodes.request import ClientGoneError
-from rlservo.serve_app.protocols import admin_routes, json_codec, pages, websocket_stream
+from rlservo.serve_app.protocols import act_json, admin_routes, pages, websocket_stream
 from rlservo.serve_app.protocols.error_statuses import Headers, error_answer, missing_route, send_reply
 from rlservo.serve_app.protocols.http_endpoint import receive_body
 from rlservo.serve_app.protocols.open_inference import infer, model_info
@@ -35,10 +34,11 @@ from rlservo.serve_app.server.access_checks import (
     presented_key,
 )
 from rlservo.serve_app.server.api_keys import Access
+from rlservo.serve_app.server.exposition import exposition
 from rlservo.serve_app.server.logs import AuditEntry
-from rlservo.serve_app.server.metrics import exposition
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.sessions.request import ClientGoneError
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 PROCESS = secrets.token_hex(8).encode()
@@ -63,7 +63,7 @@ def create_app(
     handler = RequestHandler(control, settings, replica=replica, is_alone=is_alone)
     checks = OriginChecks(host, settings, keyed=bool(handler.keys.accepted.keys))
     routes = [
-        *json_codec.routes(handler),
+        *act_json.routes(handler),
         *websocket_stream.routes(handler),
         *_health(handler),
         *admin_routes.routes(handler),

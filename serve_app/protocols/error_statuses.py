@@ -9,8 +9,8 @@ from typing import Any
 
 from starlette.types import Send
 
-from rlservo.export.contract import errors
-from rlservo.export.contract.errors import ActionError, InternalError, RlservoError, TooLargeError, UnavailableError
+from rlservo import errors
+from rlservo.errors import ActionError, InternalError, RlservoError, TooLargeError, UnavailableError
 from rlservo.serve_app.protocols.request_fields import encode_json
 from rlservo.serve_app.server.request_handler import BUG
 

@@ -8,11 +8,11 @@ from functools import partial
 
 from starlette.types import Receive
 
-from rlservo.export.contract.errors import MediaTypeError
-from rlservo.serve_app.episodes.request import ClientGoneError
+from rlservo.errors import MediaTypeError
 from rlservo.serve_app.protocols.error_statuses import JSON, Headers, too_large
 from rlservo.serve_app.protocols.routes import Answer, Call
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
+from rlservo.serve_app.sessions.request import ClientGoneError
 
 HANG_UP_TURNS = 4
 OCTETS = b"application/octet-stream"

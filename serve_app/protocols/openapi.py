@@ -18,14 +18,14 @@ from fastapi.responses import JSONResponse, PlainTextResponse
 from pydantic import BaseModel, Field, create_model
 
 import rlservo
-from rlservo.export.contract.contract import Contract
+from rlservo.bundle.contract import Contract
 from rlservo.serve_app.protocols.open_inference.infer import InferRequest, Tensor
-from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.protocols.open_inference.model_info import METHODS
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.protocols.request_fields import ActRequest
 from rlservo.serve_app.protocols.routes import POST, WEBSOCKET, Route, RoutingTable
+from rlservo.serve_app.versions.deployment_plan import Canary
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed
-from rlservo.serve_app.versions.serving_plan import Canary
 
 DESCRIPTION = "Actions from exported policies. Every error has a sentence, a code and, where useful, details."
 ERRORS = (400, 401, 403, 408, 413, 429, 503)  # of any route: its path, key, host, page, body and rate; or it loads
@@ -100,6 +100,14 @@ class PolicySummary(BaseModel):
     version_states: list[VersionStatus]
 
 
+class PlanChange(BaseModel):
+    """One change of the plan."""
+
+    generation: int
+    changed_at: str
+    changed_by: str
+
+
 class PolicyList(BaseModel):
     """Policies served by one process."""
 
@@ -108,7 +116,9 @@ class PolicyList(BaseModel):
     generation: int = Field(description="Number of the plan; equal numbers mean equal policies.")
     changed_at: str | None
     changed_by: str | None
+    recent: list[PlanChange] = Field(description="Last changes of the plan, the newest first.")
     behind: list[str] = Field(description="Parts of the plan that this process could not follow; usually empty.")
+    not_loaded: dict[str, list[str]] = Field(description="The repository's versions that the plan does not load.")
 
 
 def _type_of(field: Any) -> Any:

@@ -10,11 +10,11 @@ from typing import TypeAlias
 
 from starlette.types import Receive, Scope, Send
 
-from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.error_statuses import Headers
 from rlservo.serve_app.server.access_checks import LABEL, header_text
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import AuditEntry
+from rlservo.serve_app.sessions.request import Request
 
 GET, POST = "GET", "POST"
 WEBSOCKET = "WebSocket:"  # not a method that a client can send: those have no colon
@@ -35,7 +35,7 @@ class Call:
     """Headers of the reply besides the protocol's own."""
     audit: AuditEntry
     may_explore: bool = False
-    """Whether its key may ask for exploring actions."""
+    """Whether its key may ask for exploratory actions."""
     body: bytes = b""
     """Read unless the route's `reads_body` says otherwise."""
 

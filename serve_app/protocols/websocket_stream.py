@@ -25,8 +25,10 @@ from typing import Any
 
 from starlette.types import Message, Send
 
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import (
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.spaces import DictSpec
+from rlservo.client.formats.msgpack_arrays import pack, unpack
+from rlservo.errors import (
     InternalError,
     RequestError,
     RlservoError,
@@ -35,9 +37,6 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UnknownPolicyError,
 )
-from rlservo.export.contract.spaces import DictSpec
-from rlservo.serve_app.episodes.request import Request, new_episode_id, reply_fields
-from rlservo.serve_app.episodes.session import Session
 from rlservo.serve_app.protocols.error_statuses import describe, error_answer, send_reply
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields
 from rlservo.serve_app.protocols.routes import WEBSOCKET, Call, Route
@@ -46,8 +45,9 @@ from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_length
 from rlservo.serve_app.server.metrics import IDLE
 from rlservo.serve_app.server.request_handler import BUG, RequestHandler
-from rlservo.serve_app.versions.policy_store import Decision
-from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+from rlservo.serve_app.sessions.request import Request, new_episode_id, reply_fields
+from rlservo.serve_app.sessions.session import Session
+from rlservo.serve_app.versions.loaded_versions import Decision
 
 logger = logging.getLogger(__name__)
 
@@ -223,9 +223,7 @@ class MsgpackCodec:
                 request.obs = {name: value for name, value in content.items() if name != "reset"}
                 request.reset = content["reset"]
         else:
-            request.obs = content["obs"]
-            if len(content) > 1:
-                fill_request(request, parse_fields(ACT, content))
+            fill_request(request, parse_fields(ACT, content))
 
     def encode(self, request: Request, decision: Decision) -> bytes:
         """Return the reply's frame; `reply_options` are further timings."""

@@ -13,8 +13,8 @@ import shutil
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
-from rlservo.export.contract.bundle import load_bundle
-from rlservo.export.contract.errors import BundleError, UnavailableError
+from rlservo.bundle.bundle import load_bundle
+from rlservo.errors import BundleError, UnavailableError
 from rlservo.serve_app.repository.storage import locked
 
 

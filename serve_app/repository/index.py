@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import Self
 
-from rlservo.export.contract.bundle import SUMS_FILE, Bundle
-from rlservo.export.contract.contract import NAME_PATTERN, VERSION_PATTERN, first_fault
-from rlservo.export.contract.errors import BundleError
+from rlservo.bundle.bundle import SUMS_FILE, Bundle
+from rlservo.bundle.contract import NAME_PATTERN, VERSION_PATTERN, first_fault
+from rlservo.errors import BundleError
 from rlservo.serve_app.repository.storage import MAX_DOCUMENT_BYTES, FolderStorage
 
 if TYPE_CHECKING:
+    from rlservo.serve_app.repository.hub_storage import HubStorage
     from rlservo.serve_app.repository.object_storage import ObjectStorage
 
 INDEX = "index.json"
@@ -40,7 +41,7 @@ class Index(BaseModel):
     ] = {}
 
     @classmethod
-    def read(cls, storage: ObjectStorage | FolderStorage) -> tuple[Self, str]:
+    def read(cls, storage: ObjectStorage | HubStorage | FolderStorage) -> tuple[Self, str]:
         """Return a storage's index, empty if it has none, and the tag. Raises BundleError, UnavailableError."""
         try:
             content, tag = storage.read(INDEX, MAX_DOCUMENT_BYTES)

@@ -6,6 +6,7 @@ our own and bounded, so that a storage which sends too much or too slowly is ref
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
@@ -15,10 +16,10 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 from urllib.parse import quote, urlsplit
 
-from rlservo.export.contract.errors import BundleError, UnavailableError, UsageError, first_line
-from rlservo.export.contract.extras import install
-from rlservo.serve_app.repository.storage import TIMEOUT_S, place_of
-from rlservo.serve_app.wire.http_deadlines import FAILURES, TIMEOUTS, DeadlineBackend, connection_pool
+from rlservo.client.formats.http_connection import Connection, Response, ServerRoute
+from rlservo.errors import BundleError, UnavailableError, UsageError, first_line
+from rlservo.extras import install
+from rlservo.serve_app.repository.places import TIMEOUT_S, place_of
 
 PAGE = 2 << 20  # [bytes] of a list: 1,000 names of at most 1,024 bytes
 MOST_PAGES = 100
@@ -118,21 +119,21 @@ class ObjectStorage:
         Raises UnavailableError, and BundleError beyond `most` bytes.
         """
         place, into, reason = f"{self.uri}/{name}", into or io.BytesIO(), ""
-        headers: dict[bytes | str, bytes | str] = {_CONDITIONS[key]: given[key] for key in given if key in _CONDITIONS}
+        fields = "".join(f"{_CONDITIONS[key]}: {given[key]}\r\n" for key in given if key in _CONDITIONS).encode()
         for _ in range(2):
             url = self._signed(method, name, given)
             into.seek(0)
             into.truncate()
             try:
-                reply = self._exchange(url, headers, body, into, most)
+                reply = self._exchange(url, fields, body, into, most)
             except BundleError as error:
                 error.prefix(place)
                 raise
-            except TIMEOUTS:
+            except TimeoutError:
                 raise UnavailableError(
-                    f"{place} gave no answer within {self.timeout_s:.0f} s, or too slow a one"
+                    f"{place} gave no answer within {self.timeout_s:.0f} s, or answered too slowly"
                 ) from None
-            except FAILURES as error:
+            except ConnectionError as error:
                 length = into.tell()
                 reason = f"the connection broke after {length:,} bytes" if length else _hidden(first_line(error))
             else:
@@ -142,35 +143,30 @@ class ObjectStorage:
             time.sleep(RETRY_AFTER_S)
         raise UnavailableError(f"{place} cannot be reached or read: {reason}")
 
-    def _exchange(
-        self, url: str, headers: dict[bytes | str, bytes | str], body: bytes | None, into: BinaryIO, most: int
-    ) -> Reply:
+    def _exchange(self, url: str, fields: bytes, body: bytes | None, into: BinaryIO, most: int) -> Reply:
         """Put a body or get one; write that of a success, never unpacked, into `into`.
 
-        Raises BundleError beyond `most` bytes, and httpcore's errors, or TIMEOUTS when connecting takes longer
-        than the time-out, or the rest longer than that plus the time that the received bytes take at `SLOWEST`.
+        Raises BundleError beyond `most` bytes, ConnectionError, and TimeoutError when connecting takes longer than the
+        time-out, or the rest longer than that plus the time that the received bytes take at `SLOWEST`.
         """
-        backend = DeadlineBackend()
-        backend.deadline.at = deadline = time.monotonic() + self.timeout_s + len(body or b"") / SLOWEST
-        waits = {"timeout": dict.fromkeys(("connect", "read"), self.timeout_s)}
-        method, length, refusal = "GET" if body is None else "PUT", 0, b""
-        with (
-            connection_pool(url, backend, os.environ.get("AWS_CA_BUNDLE")) as pool,
-            pool.stream(method, url, headers=headers, content=body, extensions=waits) as reply,
-        ):
-            found = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in reply.headers}
-            for block in reply.iter_stream():
+        deadline, length, refusal = time.monotonic() + self.timeout_s + len(body or b"") / SLOWEST, 0, b""
+        parts, route = urlsplit(url), ServerRoute.to(url, os.environ.get("AWS_CA_BUNDLE"))
+        target = f"{parts.path or '/'}{'?' if parts.query else ''}{parts.query}".encode()
+        response = Response()
+        with contextlib.closing(Connection(route, min(deadline, time.monotonic() + self.timeout_s))) as connection:
+            connection.send(route.request("GET" if body is None else "PUT", target, fields, body), deadline)
+            while not response.is_complete and len(refusal) < REFUSAL:
+                connection.receive(response, min(deadline + length / SLOWEST, time.monotonic() + self.timeout_s))
+                block, response.body = response.body, bytearray()
                 length += len(block)
-                backend.deadline.at = deadline + length / SLOWEST
-                if 200 <= reply.status < 300:
-                    if length > most:
-                        raise BundleError(f"the storage sends more than the {most:,} bytes that it may")
-                    into.write(block)
-                else:
+                if not 200 <= response.status < 300:
                     refusal += block[:REFUSAL]
-                    if length >= REFUSAL:
-                        break
-            return Reply(reply.status, found, refusal.decode(errors="replace"))
+                elif length > most:
+                    raise BundleError(f"the storage sends more than the {most:,} bytes that it may")
+                else:
+                    into.write(block)
+        found = {name.decode("latin-1"): value.decode("latin-1") for name, value in response.headers}
+        return Reply(response.status, found, refusal.decode(errors="replace"))
 
     def _signed(self, method: str, name: str, given: dict[str, str]) -> str:
         if self.is_read_only:

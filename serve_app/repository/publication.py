@@ -15,34 +15,42 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rlservo.export.contract.bundle import SUMS_FILE, Bundle, digest_of
-from rlservo.export.contract.contract import VERSION_PATTERN, version_key
-from rlservo.export.contract.errors import BundleError, ConflictError, UnavailableError, UsageError
+from rlservo.bundle.bundle import SUMS_FILE, Bundle, digest_of
+from rlservo.bundle.contract import VERSION_PATTERN, version_key
+from rlservo.errors import BundleError, ConflictError, UnavailableError, UsageError
+from rlservo.serve_app.repository.hub_storage import HubStorage
 from rlservo.serve_app.repository.index import INDEX, Index, check_file_type
-from rlservo.serve_app.repository.storage import FolderStorage, place_of, storage_at
+from rlservo.serve_app.repository.places import place_of
+from rlservo.serve_app.repository.storage import FolderStorage, storage_at
 
 ATTEMPTS = 20  # at the index, each after others have published
 
 
-def publish(bundle: Bundle, place: str, *, progress: Callable[[str], object] = str) -> str:
+def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[str], object] = str) -> str:
     """Publish a bundle to a folder or URI under its own name and version; return where it is.
 
-    `progress` gets a line per uploaded file. Raises ConflictError if that version is there, or is being published,
-    UsageError if nothing can be written, UnavailableError if the storage fails, and BundleError.
+    `card` is the README.md of a hub's repository. `progress` gets a line per uploaded file. Raises ConflictError if
+    that version is there, or is being published, UsageError if nothing can be written, UnavailableError if the
+    storage fails, and BundleError.
     """
     storage = storage_at(place_of(place))
-    if storage.is_read_only:
+    is_hub = isinstance(storage, HubStorage)
+    if storage.is_read_only and not is_hub:
         raise UsageError(f"{storage.uri} can only be read: publish to a folder that its server shows, or to s3://")
     target = f"{storage.uri}/{bundle.contract.name}/{bundle.contract.version}"
     for file in bundle.sums:
         check_file_type(file, bundle.path / SUMS_FILE)
     if bundle.contract.name == INDEX:
         raise BundleError(f"a policy named {INDEX} cannot be published: the index of versions has that name")
+    if isinstance(storage, HubStorage):
+        storage.begin(
+            {f"{bundle.contract.name}/{bundle.contract.version}/{f}": copy for f, copy in _files(bundle)}, card
+        )
     index, tag = Index.read(storage)
     content = _with(index, bundle, target)
     if isinstance(storage, FolderStorage):
         _place(bundle, Path(target))
-    else:
+    elif not is_hub:  # its files come with the index, in one commit
         for file, copy in _files(bundle):
             progress(f"{target}/{file}")
             if not storage.create(f"{bundle.contract.name}/{bundle.contract.version}/{file}", copy):

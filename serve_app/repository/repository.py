@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rlservo.export.contract.bundle import (
+from rlservo.bundle.bundle import (
     DEFAULT_LIMITS,
     MAX_FILES,
     MAX_SUMS_BYTES,
@@ -26,8 +26,9 @@ from rlservo.export.contract.bundle import (
     read_contract,
     read_sums,
 )
-from rlservo.export.contract.contract import version_key
-from rlservo.export.contract.errors import (
+from rlservo.bundle.contract import version_key
+from rlservo.bundle.user_folders import default_folder
+from rlservo.errors import (
     BundleError,
     BundleTamperedError,
     RlservoError,
@@ -38,9 +39,11 @@ from rlservo.export.contract.errors import (
 )
 from rlservo.serve_app.repository.bundle_cache import BundleCache
 from rlservo.serve_app.repository.index import INDEX, Index, check_file_type
-from rlservo.serve_app.repository.storage import TIMEOUT_S, FolderStorage, default_folder, place_of, storage_at
+from rlservo.serve_app.repository.places import TIMEOUT_S, place_of
+from rlservo.serve_app.repository.storage import FolderStorage, storage_at
 
 if TYPE_CHECKING:
+    from rlservo.serve_app.repository.hub_storage import HubStorage
     from rlservo.serve_app.repository.object_storage import ObjectStorage
 
 Key = tuple[str, str]  # (name, version)
@@ -194,7 +197,7 @@ class Repository:
                 return
         raise next((error for error in errors if isinstance(error, UnavailableError)), errors[0])
 
-    def _copy(self, storage: ObjectStorage, name: str, version: str, digest: str, entry: Path) -> None:
+    def _copy(self, storage: ObjectStorage | HubStorage, name: str, version: str, digest: str, entry: Path) -> None:
         """Copy and check the files of a bundle. Raises UnavailableError, BundleError."""
         place = f"{storage.uri}/{name}/{version}"
 
@@ -251,7 +254,8 @@ def exchanged(name: str, version: str, place: object) -> BundleTamperedError:
     """Return the error for a bundle that is no longer the one whose hash was accepted."""
     return BundleTamperedError(
         f"{place} is not the bundle that was accepted as version {version} of '{name}' (its hashes differ): export or "
-        "publish changes as a new version, or load this one again"
+        "publish changes as a new version, or load this one again (`rlservo policy load`, after `unload` if it is in "
+        "use)"
     )
 
 

@@ -1,4 +1,4 @@
-"""Places that hold bundles and plans: folders, and storages named by a URI."""
+"""Storages of bundles and plans, by the place that names them: folders, and object storage."""
 
 from __future__ import annotations
 
@@ -6,63 +6,35 @@ import contextlib
 import fcntl
 import hashlib
 import os
-import re
 import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import unquote, urlsplit
 
-from rlservo.export.contract.errors import UnavailableError, UsageError
-from rlservo.export.contract.extras import needs_extra
-from rlservo.export.contract.regular_files import blocks, open_regular
+from rlservo.bundle.regular_files import blocks, open_regular
+from rlservo.errors import UnavailableError
+from rlservo.extras import needs_extra
+from rlservo.serve_app.repository.places import TIMEOUT_S, is_uri
 
 if TYPE_CHECKING:
+    from rlservo.serve_app.repository.hub_storage import HubStorage
     from rlservo.serve_app.repository.object_storage import ObjectStorage
 
-TIMEOUT_S = 30.0
 MAX_DOCUMENT_BYTES = 16 << 20  # of an index or a plan; 1,000 policies take 0.3 MB
-_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.:-]+://")  # two letters and more: C:// would be a drive
 
 
-def is_uri(place: str | Path) -> bool:
-    """Return whether a place is named by a protocol."""
-    return isinstance(place, str) and _SCHEME.match(place) is not None
-
-
-def place_of(place: str | Path) -> str:
-    """Return an absolute folder (or `file://`) or a URI that holds no secret. Raises UsageError."""
-    if not is_uri(place):
-        return str(Path(place).expanduser().absolute())
-    parts = urlsplit(str(place).rstrip("/"))
-    if parts.scheme == "file" and parts.netloc in ("", "localhost"):
-        return unquote(parts.path) or "/"
-    if parts.scheme not in ("s3", "http", "https") or not parts.hostname or "@" in parts.netloc or parts.query:
-        shown = f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
-        raise UsageError(
-            f"{shown}: expected s3://bucket/policies, https://host/policies or file:///policies; a password or query "
-            "may be a secret, and credentials come from the environment"
-        )
-    return parts.geturl()
-
-
-def default_folder(variable: str = "XDG_CACHE_HOME", below_home: str = ".cache") -> Path:
-    """Return the user's folder for what rlservo keeps. Raises UsageError."""
-    root = os.environ.get(variable)
-    try:
-        return (Path(root) if root else Path.home() / below_home) / "rlservo"
-    except RuntimeError:  # a container's user without a home
-        raise UsageError(f"this user has no home folder: name a folder in {variable}") from None
-
-
-def storage_at(place: str, timeout_s: float = TIMEOUT_S) -> ObjectStorage | FolderStorage:
+def storage_at(place: str, timeout_s: float = TIMEOUT_S) -> ObjectStorage | HubStorage | FolderStorage:
     """Return the storage at a place; a call to object storage may take half of `timeout_s`, to be named in time.
 
     Raises UsageError.
     """
     if not is_uri(place):
         return FolderStorage(Path(place))
-    with needs_extra("remote", "httpcore"):
+    if place.startswith("hf://"):
+        with needs_extra("hub", "huggingface_hub"):
+            from rlservo.serve_app.repository.hub_storage import HubStorage
+        return HubStorage(place, timeout_s=timeout_s / 2)
+    with needs_extra("remote", "httptools"):
         from rlservo.serve_app.repository.object_storage import ObjectStorage
     return ObjectStorage(place, timeout_s=timeout_s / 2)
 

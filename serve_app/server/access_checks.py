@@ -18,11 +18,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rlservo.export.contract.errors import ForbiddenError, RequestError, UnauthenticatedError
+from rlservo.client.formats.addresses import is_loopback
+from rlservo.client.formats.request_names import LABEL_HEADER
+from rlservo.errors import ForbiddenError, RequestError, UnauthenticatedError
 from rlservo.serve_app.server.api_keys import SCHEMES, Access, Key, Role
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.wire.addresses import is_loopback
-from rlservo.serve_app.wire.request_names import LABEL_HEADER
 
 if TYPE_CHECKING:
     from starlette.types import Scope
@@ -135,7 +135,7 @@ class StreamKey:
     presented: bytes | None
 
     def check(self) -> bool:
-        """Return whether the key may ask for exploring actions.
+        """Return whether the key may ask for exploratory actions.
 
         Raises as `authorize` does; RateLimitError concerns only this request.
         """

@@ -23,10 +23,10 @@ from pathlib import Path
 
 from typing_extensions import Self
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.regular_files import NotReadableError, blocks, open_regular
+from rlservo.bundle.regular_files import NotReadableError, blocks, open_regular
+from rlservo.client.formats.addresses import is_loopback
+from rlservo.errors import UsageError
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.wire.addresses import is_loopback
 
 LINE = re.compile(
     r"(?P<label>[A-Za-z0-9][A-Za-z0-9._-]{0,63})\s+(?P<role>act|explore|admin)\s+sha256:(?P<digest>[0-9a-f]{64})"

@@ -16,11 +16,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import orjson
 
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import TooLargeError
-from rlservo.export.contract.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
-from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
+from rlservo.errors import TooLargeError
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 
 SMALL = 1 << 14  # [bytes] content up to which no parser takes long
 SPARE = 1000  # values besides observations and states: options, tensors, names

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from rlservo.export.contract.errors import RateLimitError, UnavailableError, UsageError
+from rlservo.errors import RateLimitError, UnavailableError, UsageError
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, read_key_file
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
@@ -66,7 +66,7 @@ class CurrentKeys:
         self._used: bytes | str | None = None
 
     async def refresh(self) -> None:
-        """Read the file; use its content once two reads in a row have seen the same."""
+        """Read the file; use its content once two reads in a row agree."""
         assert self._settings.api_keys_file is not None
         file, before = Path(self._settings.api_keys_file), self._seen
         try:

@@ -12,7 +12,8 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
 
     `version` is the target of the alias `production`, `versions` are those that answer, the oldest first, `previous` is
     the target of a rollback of each alias. A version is `loading`, `ready` or `failed`. `generation` is the plan's
-    number; `behind` lists the parts of it that this process could not follow.
+    number, `recent` names the last changes of the plan; `behind` lists the parts of it that this process could not
+    follow, `not_loaded` the versions of the repository that the plan does not load, by policy, at the last look.
     """
     store, control = handler.store(), handler.control
     plan, states = control.plan, control.states()
@@ -47,5 +48,7 @@ def describe(handler: RequestHandler) -> dict[str, Any]:
         "generation": plan.generation if plan is not None else 0,
         "changed_at": plan and plan.changed_at,
         "changed_by": plan and plan.changed_by,
+        "recent": [each.model_dump(include={"generation", "changed_at", "changed_by"}) for each in control.recent],
         "behind": list(control.behind),
+        "not_loaded": control.not_loaded(),
     }

@@ -13,12 +13,12 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.episodes.request import Request
+from rlservo.errors import UsageError
 from rlservo.serve_app.server.access_checks import READING
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.serve_app.sessions.request import Request
+from rlservo.serve_app.versions.loaded_versions import Decision
 
 LOGGER = "rlservo"
 FIELDS = "fields"  # attribute of a record that holds its fields

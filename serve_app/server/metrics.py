@@ -1,16 +1,15 @@
 """Prometheus metrics of one process, or of all workers of a server if they share a folder.
 
-Histograms take values directly. Counters and gauges are sampled from the server's own numbers when Prometheus asks and,
-where several workers share their metrics, every second. Every series has the label `replica`, the process that counted
+Counters, gauges and the times of answers are sampled from the server's own numbers when Prometheus asks and, where
+several workers share their metrics, every second. Every series has the label `replica`, the process that counted
 it: if PROMETHEUS_MULTIPROC_DIR names a folder, the client library keeps values in files there and each worker answers
-for all.
+for all. The counts of a worker that has ended stay for a while, and those that died without an orderly end are counted.
 
 Names follow Prometheus' conventions (base units, `_total`).
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import itertools
 import math
@@ -19,11 +18,10 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import prometheus_client
 import psutil
 from prometheus_client import CollectorRegistry, Gauge, Histogram, generate_latest
@@ -31,16 +29,15 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.registry import Collector
 
-from rlservo.serve_app.versions.policy_store import Decision
-
-if TYPE_CHECKING:
-    from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.client.formats.request_names import SUCCESS
+from rlservo.serve_app.versions.loaded_versions import Decision
 
 FOLDER_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"  # read by prometheus_client when it is imported
 EVERY_S = 1.0
-MAX_ELEMENTS = 128  # not a series for each pixel of an image: only the largest is shown
+MOST_UNTIMED = 100  # answers, which take 0.2 ms together
+KEPT_S = 600.0  # that the counts of an ended worker stay: a promotion looks more often
+BEGAN, LEFT, GONE = ".began", ".left", ".gone"  # marks of a worker in the folder: its start, orderly end, end seen
 IDLE = "idle"  # close code of a stream that was silent for too long
-SUCCESS = "success"  # the environments' final status of an episode that reached its goal
 SECONDS = (1e-5, 2.5e-5, 5e-5, 1e-4, 2.5e-4, 5e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0)
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096)
 DIFFERENCES = (1e-6, 1e-5, 1e-4, 1e-3, 2.5e-3, 5e-3, 1e-2, 2.5e-2, 5e-2, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
@@ -67,6 +64,17 @@ class Answers:
     count: int = 0
     observations: int = 0
     last_s: float = 0.0  # since 1970
+    untimed: list[tuple[float, float, int | None]] = field(default_factory=list)
+    """Latency, inference [s] and batch of the latest, not in the histograms yet: together they take less time."""
+
+    def time(self) -> None:
+        """Bring the histograms up to date."""
+        for latency, inference, batch in self.untimed:
+            self.latency.observe(latency)
+            self.inference.observe(inference)
+            if batch is not None:
+                self.batch.observe(batch)
+        self.untimed.clear()
 
 
 class Metrics(Collector):
@@ -74,8 +82,9 @@ class Metrics(Collector):
 
     def __init__(self, replica: str = "") -> None:
         self._replica = replica
-        self.began = time.monotonic()
+        self.began, self.began_at = time.monotonic(), time.time()
         self.folder = os.environ.get(FOLDER_VARIABLE)  # that several workers share
+        self._mark(BEGAN)
         self._registry = registry = CollectorRegistry()
         self._counted = CollectorRegistry()  # what is sampled
         self._sampled: dict[str, Any] = {}  # counters and gauges by name
@@ -110,10 +119,9 @@ class Metrics(Collector):
             latency, inference, batch = self._latency, self._inference, self._batch
             answers = Answers(latency.labels(*labels), inference.labels(*labels), batch.labels(*labels))
             self.answers[key] = answers
-        answers.latency.observe(seconds)
-        answers.inference.observe(decision.infer_ms / 1e3)
-        if decision.batch is not None:
-            answers.batch.observe(decision.batch)
+        answers.untimed.append((seconds, decision.infer_ms / 1e3, decision.batch))
+        if len(answers.untimed) == MOST_UNTIMED:
+            answers.time()
         answers.count += 1
         answers.observations += decision.batch or 1
         answers.last_s = time.time()
@@ -134,7 +142,10 @@ class Metrics(Collector):
 
     def answers_of(self, policy: str, version: str) -> list[Answers]:
         """Return the answers of a version since the start, one for each protocol."""
-        return [answers for key, answers in self.answers.items() if key[:2] == (policy, version)]
+        found = [answers for key, answers in self.answers.items() if key[:2] == (policy, version)]
+        for answers in found:
+            answers.time()
+        return found
 
     def counter(self, name: str, documentation: str, total: float, **labels: str) -> None:
         """Raise a counter to a total; a smaller total than before has restarted from zero."""
@@ -165,6 +176,15 @@ class Metrics(Collector):
             self._sampled[name] = kind(name, documentation, ["replica", *labels], registry=self._counted, **mode)
         return self._sampled[name].labels(self._replica, *values)
 
+    def leave(self) -> None:
+        """Note that this process shuts down cleanly: a worker without this note has died."""
+        self._mark(LEFT)
+
+    def _mark(self, mark: str) -> None:
+        if self.folder is not None and self._replica:
+            with contextlib.suppress(OSError):  # removed with the last of the server
+                Path(self.folder, f"{self._replica}{mark}").touch()
+
     def text(self) -> bytes:
         """Return all metrics as Prometheus reads them: of this process, or of all workers."""
         return generate_latest(self)
@@ -172,12 +192,18 @@ class Metrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield the current metric families."""
         # Counters come first here and in the files: no answer is counted before it is timed.
-        own = itertools.chain(self._counted.collect(), self._registry.collect())
-        for family in own if self.folder is None else _of_all_workers(Path(self.folder)):
+        own: Iterable[Metric] = itertools.chain(self._counted.collect(), self._registry.collect())
+        if self.folder is not None:
+            own = _of_all_workers(Path(self.folder))
+        for family in own:
             family.samples = [
                 each for each in family.samples if not math.isnan(each.value) and not each.name.endswith("_created")
             ]
             yield family
+
+    def lost_workers(self) -> int | None:
+        """Return how many workers have died without an orderly end; None where none share their metrics."""
+        return None if self.folder is None else len(_ended(Path(self.folder))[1])
 
 
 def sum_of(histogram: Histogram) -> float:
@@ -187,104 +213,33 @@ def sum_of(histogram: Histogram) -> float:
 
 
 def _of_all_workers(folder: Path) -> Iterable[Metric]:
-    """Return the families from the files of running workers; the files of dead ones are removed."""
-    living = []
+    """Return the families from the workers' files; those of ended ones are removed, their counts' after a while."""
+    ended, _ = _ended(folder)
+    shown = []
     for file in sorted(folder.glob("*.db")):  # such as histogram_4711.db; those of counters come first
-        if psutil.pid_exists(int(file.stem.rpartition("_")[2])):
-            living.append(str(file))
+        kind, _, worker = file.stem.rpartition("_")
+        if worker not in ended or (kind in ("counter", "histogram") and ended[worker] < KEPT_S):
+            shown.append(str(file))
         else:
             file.unlink(missing_ok=True)
     try:
-        families: Iterable[Metric] = MultiProcessCollector.merge(living)  # type: ignore[no-untyped-call]
+        families: Iterable[Metric] = MultiProcessCollector.merge(shown)  # type: ignore[no-untyped-call]
     except FileNotFoundError:  # of a worker that has just died
         return _of_all_workers(folder)
     return families
 
 
-async def exposition(handler: RequestHandler) -> bytes:
-    """Return all metrics as Prometheus reads them."""
-    await sample(handler)
-    return await asyncio.to_thread(handler.metrics.text)  # thousands of series take a while
-
-
-async def sample(handler: RequestHandler) -> None:
-    """Bring all counters and gauges up to date."""
-    for part in (requests, versions, process, sessions):
-        part(handler)
-    handler.metrics.end_round()
-
-
-def requests(handler: RequestHandler) -> None:
-    """Sample the counts of requests, streams, episodes and shadows."""
-    show = handler.metrics
-    outcomes = {(*key, "ok"): answers.count for key, answers in show.answers.items()} | show.failures
-    for (policy, version, protocol, code), count in outcomes.items():
-        which = {"policy": policy, "version": version, "protocol": protocol, "code": code}
-        show.counter("rlservo_requests", "Requests by outcome", count, **which)
-    for policy, count in handler.admission.streams.items():
-        show.gauge("rlservo_streams", "Open WebSockets", count, policy=policy)
-    for (policy, version, succeeded), count in show.ends.items():
-        which = {"policy": policy, "version": version, "outcome": SUCCESS if succeeded else "other"}
-        show.counter("rlservo_episode_ends", "Episodes whose end a client reported (`final_status`)", count, **which)
-    for ((policy, version, shadow), reason), count in list(handler.shadows.missed.items()):
-        which = {"policy": policy, "version": version, "shadow": shadow, "reason": reason}
-        show.counter("rlservo_shadow_missed", "Actions not compared with a shadow's", count, **which)
-
-
-def versions(handler: RequestHandler) -> None:
-    """Sample the plan that this process follows, and each version's default flag, batches and drift."""
-    show = handler.metrics
-    plan, store = handler.control.plan, handler.control.store
-    if plan is None or store is None:
-        return
-    show.gauge("rlservo_plan_generation", "Plan that this process follows", plan.generation)
-    for policy in store.policies:
-        name, version = policy.contract.name, policy.contract.version
-        which, is_default = {"policy": name, "version": version}, version == store.default(name)
-        show.gauge("rlservo_policy_loaded", "1 for the default version, 0 for the others", is_default, **which)
-        drift = policy.drift
-        if drift is None:
+def _ended(folder: Path) -> tuple[dict[str, float], set[str]]:
+    """Return how long ago [s] the end of each ended worker was seen, and those of them that did not end in order."""
+    ended, lost = {}, set()
+    for began in folder.glob(f"*{BEGAN}"):
+        if psutil.pid_exists(int(began.stem)):
             continue
-        show.counter("rlservo_observation_looks", "Observations checked for drift", drift.looks, **which)
-        elements, moved, varied = drift.elements if drift.looks else (), drift.shift, drift.spread
-        if len(elements) > MAX_ELEMENTS:
-            elements, moved, varied = ("largest",), moved[[np.argmax(np.abs(moved))]], varied[[np.argmax(varied)]]
-        for element, mean, deviation in zip(elements, moved.tolist(), varied.tolist()):  # noqa: B905 - none before a look
-            shift = "Shift of an observation element's mean from training's, in training's standard deviations"
-            show.gauge("rlservo_observation_shift", shift, mean, **which, element=element)
-            spread = "Standard deviation of an observation element, relative to training"
-            show.gauge("rlservo_observation_spread", spread, deviation, **which, element=element)
-
-
-def process(handler: RequestHandler) -> None:
-    """Sample this process's queue, API keys and recording."""
-    admission, keys, show = handler.admission, handler.keys, handler.metrics
-    show.gauge("rlservo_uptime_seconds", "Time since this process' start", time.monotonic() - show.began)
-    waited = "Largest number of requests that waited for the processor at once, since the start"
-    show.gauge("rlservo_queue_longest", waited, admission.longest)
-    show.gauge("rlservo_requests_incoming", "Requests whose body is still arriving", admission.incoming)
-    current = "1 while the API keys in use are those of their file; 0 if older keys stay in use"
-    show.gauge("rlservo_api_keys_current", current, keys.current)
-    for label, count in keys.limits.refused.items():
-        show.counter("rlservo_rate_limited", "Requests refused because their key exceeded its rate", count, key=label)
-    if handler.recorder is not None:
-        recorder = handler.recorder.recorder
-        goes_on = "1 while decisions are recorded; 0 if the folder cannot be written"
-        show.gauge("rlservo_recording", goes_on, recorder.failure is None)
-        show.counter("rlservo_records_written", "Decisions and outcomes in the recording", recorder.written)
-        show.counter("rlservo_records_dropped", "Decisions dropped by a full recording buffer", recorder.dropped)
-
-
-def sessions(handler: RequestHandler) -> None:
-    """Sample the episodes in memory."""
-    episodes, kept, show = handler.episodes, handler.episodes.sessions, handler.metrics
-    now = kept.count()
-    for name in sorted({*now, *episodes.begun, *episodes.lost}):
-        show.gauge("rlservo_sessions", "Sessions in this process", now[name], policy=name)
-        show.counter("rlservo_sessions_begun", "Sessions begun", episodes.begun[name], policy=name)
-        show.counter("rlservo_sessions_evicted", "Sessions forgotten when idle", kept.evicted[name], policy=name)
-        show.counter("rlservo_sessions_lost", "Requests for unknown sessions", episodes.lost[name], policy=name)
-    if episodes.store is not None:
-        failed = "Failed reads and writes of sessions in Redis; the requests were answered with 503"
-        show.counter("rlservo_session_store_failures", failed, episodes.store.unreachable)
-    show.gauge("rlservo_episodes_remembered", "Episodes in memory, in sessions and on streams", kept.rows)
+        gone = began.with_suffix(GONE)
+        with contextlib.suppress(OSError):  # of another server's folder that is being removed
+            if not gone.exists():
+                gone.touch()
+            ended[began.stem] = time.time() - gone.stat().st_mtime
+        if not began.with_suffix(LEFT).exists():
+            lost.add(began.stem)
+    return ended, lost

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from rlservo.export.contract.errors import RequestError, UsageError
+from rlservo.bundle.bundle import load_bundle
+from rlservo.errors import RequestError, UsageError
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import plan_follower
-from rlservo.serve_app.versions.plan_commands import Changed, parse
-from rlservo.serve_app.versions.serving_plan import Plan
+from rlservo.serve_app.versions.deployment_plan import Plan
+from rlservo.serve_app.versions.plan_commands import Changed, Evaluate, parse
 
 
 class OfflineCommands:
@@ -27,7 +29,7 @@ class OfflineCommands:
         except RequestError as error:
             raise UsageError(error.message) from None
         plan = asyncio.run(self._control.write(given, name))
-        return {**Changed.of(plan, name).model_dump(), "place": self._control.files.place}
+        return {**Changed.of(plan, name, given.notes).model_dump(), "place": self._control.files.place}
 
     def listing(self) -> dict[str, Any]:
         """Return the newest plan, and for each policy the versions of the repository that it does not load.
@@ -48,7 +50,9 @@ class OfflineCommands:
         for name, versions in listing.digests.items():
             loaded = plan.policies[name].versions if name in plan.policies else {}
             others[name] = [version for version in versions if version not in loaded]
-        described = {name: Changed.of(plan, name).model_dump(exclude={"generation", "policy"}) for name in others}
+        described = {
+            name: Changed.of(plan, name).model_dump(exclude={"generation", "policy", "notes"}) for name in others
+        }
         return {
             "place": files.place,
             "generation": plan.generation,
@@ -57,3 +61,23 @@ class OfflineCommands:
             "policies": [{"name": name, **described[name], "not_loaded": others[name]} for name in sorted(others)],
             "errors": [error.message for error in listing.errors.values()],
         }
+
+
+def accept_evaluation(folder: Path, before: str) -> list[str]:
+    """Replace a bundle's hash from before its evaluation in every plan of its folders; return the plans' places.
+
+    Those are the bundle's own, its policy's and the repository's, as served: each may be what a server was given.
+    Raises RefusedError if the bundle cannot be served, UnavailableError if a plan cannot be read or written.
+    """
+    bundle, settings = load_bundle(folder), ServerSettings.from_environment()
+    name, version = bundle.contract.name, bundle.contract.version
+    command, places = Evaluate.of(version, before, bundle.digest), list[str]()
+    for place in (folder, folder.parent, folder.parent.parent):
+        control = plan_follower([place], settings)
+        if control.files.place in places:  # RLSERVO_PLAN
+            continue
+        plan = control.files.newest()
+        if plan is not None and command.change(plan, name) != plan.policies:
+            asyncio.run(control.write(command, name))
+            places.append(control.files.place)
+    return places

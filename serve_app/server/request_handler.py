@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from rlservo.export.contract.errors import (
+from rlservo.errors import (
     ForbiddenError,
     InternalError,
     ObservationError,
@@ -27,18 +27,18 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UnknownPolicyError,
 )
-from rlservo.serve_app.episodes.episodes import Episodes
-from rlservo.serve_app.episodes.request import ClientGoneError, Request, check_deadline
 from rlservo.serve_app.server.access_checks import StreamKey
-from rlservo.serve_app.server.admission import Admission
 from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.current_keys import CurrentKeys
+from rlservo.serve_app.server.load_shedding import LoadShedding
 from rlservo.serve_app.server.logs import FIELDS, write_answer, write_failure
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.settings import MEMORY, ServerSettings
+from rlservo.serve_app.sessions.request import ClientGoneError, Request, check_deadline
+from rlservo.serve_app.sessions.session_actions import Episodes
+from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
 
 if TYPE_CHECKING:
@@ -91,10 +91,10 @@ class RequestHandler:
         self.replica = replica
         self.keys = CurrentKeys(settings)
         self.settings = settings
-        self.admission = Admission(settings)
+        self.admission = LoadShedding(settings)
         sessions = None
         if settings.session_store != MEMORY:
-            from rlservo.serve_app.episodes.redis_sessions import RedisSessions  # only several workers need it
+            from rlservo.serve_app.sessions.redis_sessions import RedisSessions  # only several workers need it
 
             patience_s = self.admission.max_wait_s
             sessions = RedisSessions(settings.session_store, idle_s=settings.session_idle_s, patience_s=patience_s)

@@ -20,21 +20,21 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError
-from rlservo.export.contract.extras import needs_extra
-from rlservo.serve_app.episodes.request import Request, shorten_label
-from rlservo.serve_app.recording.policy_format import LeafArrays, PolicyFormat
-from rlservo.serve_app.runtime.exploration import Draw
-from rlservo.serve_app.runtime.input_numbers import parse_array
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.errors import ObservationError, RequestError, RlservoError, UnknownPolicyError
+from rlservo.extras import needs_extra
+from rlservo.policy.exploration import Draw
+from rlservo.policy.input_numbers import parse_array
+from rlservo.policy.policy import Policy
+from rlservo.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
+from rlservo.serve_app.sessions.request import Request, shorten_label
+from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore
 
 with needs_extra("record", what="recording"):
-    from rlservo.serve_app.recording.recorder import Recorder
-    from rlservo.serve_app.recording.records import DecisionRecord, OutcomeRecord
+    from rlservo.recording.recorder import Recorder
+    from rlservo.recording.records import DecisionRecord, OutcomeRecord
 
 logger = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from typing_extensions import Self
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.serve_app.runtime.options import PolicyOptions
+from rlservo.errors import UsageError
+from rlservo.policy.options import PolicyOptions
 
 PREFIX = "RLSERVO_"
 MEMORY = "memory"  # this process's memory, where sessions are kept by default
@@ -31,7 +31,7 @@ class ServerSettings(BaseModel):
     """onnxruntime threads per policy; one is fastest for networks of kilobytes and keeps concurrent requests apart."""
 
     max_body_bytes: int = Field(4 << 20, ge=1024)
-    """A larger request body is refused with 413 before it is read to the end. A request for actions that is larger than
+    """A larger request body is refused with 413 before all of it is read. A request for actions that is larger than
     `max_batch` observations of its policy need is refused unparsed."""
 
     max_batch: int = Field(4096, ge=1)
@@ -42,20 +42,20 @@ class ServerSettings(BaseModel):
     do this)."""
 
     max_ongoing_requests: int = Field(128, ge=1)
-    """Most requests that may wait for one process; further ones get 503 immediately."""
+    """Largest number of requests that may wait for one process; further ones get 503 immediately."""
 
     max_queue_ms: float = Field(1000.0, gt=0, allow_inf_nan=False)
     """[ms] Requests that have waited longer get 503 and are not computed."""
 
     max_incoming: int = Field(512, ge=1)
-    """Most requests per process whose body is still being sent."""
+    """Largest number of requests per process whose body is still being sent."""
 
     max_streams: int = Field(256, ge=1)
-    """Most streams (WebSocket, gRPC) that may be open, per process."""
+    """Largest number of streams (WebSocket, gRPC) that may be open, per process."""
 
     max_connections_per_address: int = Field(1024, ge=0)
-    """Most connections from one client address to a process of the embedded server, of 4096 in total; further ones get
-    429, many more are closed at once. 0: no bound, for a server behind a proxy."""
+    """Largest number of connections from one client address to a process of the embedded server, of 4096 in
+    total; further ones get 429, many more are closed at once. 0: no bound, for a server behind a proxy."""
 
     trusted_proxies: str = ""
     """Addresses, separated by commas, of proxies in front of the embedded server whose `X-Forwarded-For` names the
@@ -108,8 +108,8 @@ class ServerSettings(BaseModel):
     database of its own. Also set by `rlservo serve --session-store`."""
 
     max_sessions: int = Field(1024, ge=1)
-    """Most episodes that one process remembers at once, in sessions and on streams (each row of a batch is one);
-    further ones get 503."""
+    """Largest number of episodes that one process remembers at once, in sessions and on streams (each row of a
+    batch is one); further ones get 503."""
 
     session_idle_s: float = Field(300.0, gt=0, allow_inf_nan=False)
     """[s] A session without a step for this long is forgotten; a stream keeps its episode while it is open."""

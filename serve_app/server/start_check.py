@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rlservo.export.contract.bundle import BundleLimits
+from rlservo.bundle.bundle import BundleLimits
+from rlservo.errors import RlservoError
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.repository.repository import Repository
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.version_loader import VersionLoader
+
+LOOK_S = 10.0  # [s] that a start waits for a look through the repository
 
 
 def load_served(places: Sequence[str | Path], served: Any, settings: ServerSettings | None = None) -> PolicyStore:
@@ -23,10 +27,34 @@ def load_served(places: Sequence[str | Path], served: Any, settings: ServerSetti
 
     Raises UsageError or BundleError, and UnavailableError if a file system or storage does not answer.
     """
+    return checked_start(places, served, settings)[0]
+
+
+def checked_start(
+    places: Sequence[str | Path], served: Any, settings: ServerSettings | None = None
+) -> tuple[PolicyStore, list[str]]:
+    """Return what `load_served` does, and a sentence for each bundle that is not served."""
     control = plan_follower(places, settings or ServerSettings.from_environment(environment={}))
-    asyncio.run(control.configure(served))
+
+    async def start() -> list[str]:
+        await control.configure(served)
+        return await not_served(control)
+
+    left_out = asyncio.run(start())
     assert control.store is not None
-    return control.store
+    return control.store, left_out
+
+
+async def not_served(control: PlanFollower) -> list[str]:
+    """Return a sentence for each bundle that is not served; none if the look takes too long or fails."""
+    if control.has_looked:  # for the first plan
+        return control.not_served()
+    look = asyncio.create_task(control.look())
+    await asyncio.wait({look}, timeout=LOOK_S)
+    look.cancel()
+    with contextlib.suppress(RlservoError, asyncio.CancelledError):
+        await look
+    return control.not_served()
 
 
 def plan_follower(places: Sequence[str | Path], settings: ServerSettings) -> PlanFollower:

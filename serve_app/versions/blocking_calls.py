@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from functools import partial
 from typing import Any, TypeVar
 
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.errors import UnavailableError
 
 logger = logging.getLogger(__name__)
 

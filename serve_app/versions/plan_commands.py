@@ -5,21 +5,21 @@ A command returns the policies after it, and leaves the plan as it is. No comman
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 from typing_extensions import Self
 
-from rlservo.export.contract.contract import first_fault, version_key
-from rlservo.export.contract.errors import (
+from rlservo.bundle.contract import first_fault, version_key
+from rlservo.errors import (
     ConflictError,
     RequestError,
     UnknownVersionError,
 )
-from rlservo.serve_app.interface import PRODUCTION
+from rlservo.policy.acting_policy import PRODUCTION
 from rlservo.serve_app.repository.repository import Listing
-from rlservo.serve_app.versions.serving_plan import (
+from rlservo.serve_app.versions.deployment_plan import (
     Alias,
     Canary,
     Plan,
@@ -42,6 +42,12 @@ class Command(BaseModel):
     verb: ClassVar[str]
     summary: ClassVar[str]
     nothing: ClassVar[str] = ""  # the word for a command without values
+    _notes: list[str] = PrivateAttr(default_factory=list)
+
+    @property
+    def notes(self) -> list[str]:
+        """What differs without harm between the versions that it gives to the same clients."""
+        return self._notes
 
     def line(self, name: str) -> str:
         """Return the command as `rlservo policy` takes it, for the plan and the logs."""
@@ -86,6 +92,36 @@ class Poll(Load):
     """Add a newer version that a server has found by itself."""
 
     verb = "poll"
+
+
+class Evaluate(Command):
+    """Accept a bundle with more evaluations in its contract instead of the one before; the network is the same.
+
+    Aliases, canary and shadow stay, and a rollback finds it too. No server takes this command: `rlservo verify` gives
+    it where it has written the contract.
+    """
+
+    verb = "verify"
+    version: Version
+    _digests: tuple[str, str] = PrivateAttr(("", ""))
+
+    @classmethod
+    def of(cls, version: str, before: str, after: str) -> Self:
+        """Return the command for the hashes of a bundle before and after its evaluation."""
+        command = cls(version=version)
+        command._digests = (before, after)
+        return command
+
+    def change(self, plan: Plan, name: str) -> Policies:
+        policy, (before, after) = plan.policies.get(name), self._digests
+        if policy is None:
+            return plan.policies
+
+        def accepted(digests: Mapping[str, str]) -> dict[str, str]:
+            return {v: after if (v, each) == (self.version, before) else each for v, each in digests.items()}
+
+        changes = {"versions": accepted(policy.versions), "unloaded": accepted(policy.unloaded)}
+        return {**plan.policies, name: policy.model_copy(update=changes)}
 
 
 class Unload(Command):
@@ -194,13 +230,14 @@ class Changed(BaseModel):
     aliases: dict[str, str]
     canary: Canary | None
     shadow: str | None
+    notes: list[str] = Field([], description="Harmless differences of the version that clients get now.")
 
     @classmethod
-    def of(cls, plan: Plan, name: str) -> Changed:
+    def of(cls, plan: Plan, name: str, notes: Sequence[str] = ()) -> Changed:
         """Return a policy's state in a plan."""
         policy = plan.policies.get(name) or PolicyPlan()
         state = {field: getattr(policy, field) for field in ("default", "aliases", "canary", "shadow")}
-        return cls(generation=plan.generation, policy=name, versions=list(policy.versions), **state)
+        return cls(generation=plan.generation, policy=name, versions=list(policy.versions), notes=list(notes), **state)
 
 
 def parse(command: str, document: dict[str, Any]) -> Command:

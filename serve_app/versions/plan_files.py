@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import os
-import re
 import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,27 +17,32 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import ValidationError
 
-from rlservo.export.contract.bundle import CONTRACT_FILE
-from rlservo.export.contract.contract import first_fault
-from rlservo.export.contract.errors import UnavailableError
-from rlservo.serve_app.repository.storage import (
-    MAX_DOCUMENT_BYTES,
-    TIMEOUT_S,
-    FolderStorage,
-    default_folder,
-    is_uri,
-    place_of,
-    storage_at,
+from rlservo.bundle.bundle import CONTRACT_FILE
+from rlservo.bundle.contract import first_fault
+from rlservo.bundle.production import PLAN_FOLDER as FOLDER
+from rlservo.bundle.production import (
+    NotAPlanError,
+    check_number,
+    hash_of,
+    newest_plan,
+    not_ours,
+    note_of,
+    plan_name,
 )
+from rlservo.bundle.user_folders import default_folder, plans_folder
+from rlservo.errors import UnavailableError, UsageError
+from rlservo.serve_app.repository.places import TIMEOUT_S, is_uri, place_of
+from rlservo.serve_app.repository.storage import MAX_DOCUMENT_BYTES, FolderStorage, storage_at
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.serving_plan import Plan
+from rlservo.serve_app.versions.deployment_plan import Plan
 
 if TYPE_CHECKING:
+    from rlservo.serve_app.repository.hub_storage import HubStorage
     from rlservo.serve_app.repository.object_storage import ObjectStorage
 
-FOLDER = ".plan"
 FOLDER_POLL_S = 0.5
 STORAGE_POLL_S = 5.0
+MOST_RECENT = 20
 
 Result = TypeVar("Result")
 
@@ -81,8 +84,11 @@ class PlanFiles:
 
     def newest(self) -> Plan | None:
         """Return the newest plan, if there is one. Raises UnavailableError."""
-        numbers = [int(name[:-5]) for name in self._storage.names(FOLDER) if re.fullmatch(r"\d{9}\.json", name)]
-        return self._read(max(numbers)) if numbers else None
+        try:
+            number = newest_plan(self._storage.names(FOLDER), lambda number: self._read(number) is not None)
+        except NotAPlanError as fault:
+            raise UnavailableError(not_ours(self._storage.uri, fault)) from None
+        return None if number is None else self._read(number)
 
     def after(self, number: int) -> Plan | None:
         """Return the newest plan that has followed one; None if none has. Raises UnavailableError."""
@@ -90,6 +96,15 @@ class PlanFiles:
         while (following := self._read(number + 1)) is not None:
             plan, number = following, number + 1
         return plan
+
+    def recent(self, plan: Plan, most: int = MOST_RECENT) -> tuple[Plan, ...]:
+        """Return a plan and those before it, the newest first; from object storage the plan alone: each is a request.
+
+        Raises UnavailableError.
+        """
+        first = plan.generation if self._copy is not None else max(1, plan.generation - most + 1)
+        earlier = (self._read(number) for number in range(plan.generation - 1, first - 1, -1))
+        return (plan, *(each for each in earlier if each is not None))
 
     def create(self, plan: Plan) -> bool:
         """Write a plan under its number; return False if that is taken. Raises UnavailableError."""
@@ -106,8 +121,20 @@ class PlanFiles:
                 return Plan.model_validate_json(self._copy.read_bytes())
         return None
 
+    def note_places(self) -> None:
+        """Note for this user's other processes where the plan of each local place is, if not in the place itself."""
+        for place in self._places:
+            if self._root is None and not is_uri(place):
+                with contextlib.suppress(OSError, UsageError):  # no home, or one that cannot be written
+                    note = note_of(place)
+                    if self._storage.uri == place:
+                        note.unlink(missing_ok=True)
+                    else:
+                        note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                        note.write_text(self._storage.uri)
+
     @functools.cached_property
-    def _storage(self) -> ObjectStorage | FolderStorage:
+    def _storage(self) -> ObjectStorage | HubStorage | FolderStorage:
         return storage_at(self._root or _first_writable(self._places), self._timeout_s)
 
     @functools.cached_property
@@ -115,7 +142,7 @@ class PlanFiles:
         if isinstance(self._storage, FolderStorage):
             return None
         folder = Path(self._cache) if self._cache is not None else default_folder() / "bundles"
-        return folder / f".plan-{_hash(self._storage.uri)}"
+        return folder / f".plan-{hash_of(self._storage.uri)}"
 
     def _read(self, number: int) -> Plan | None:
         name = _name(number)
@@ -127,6 +154,10 @@ class PlanFiles:
         except ValidationError as error:
             place = f"{self._storage.uri}/{name}"
             raise UnavailableError(f"{place} is not a plan that this rlservo can read: {first_fault(error)}") from None
+        try:
+            check_number(number, plan.generation)
+        except NotAPlanError as fault:
+            raise UnavailableError(not_ours(self._storage.uri, fault)) from None
         self._remember(content)
         return plan
 
@@ -140,11 +171,7 @@ class PlanFiles:
 
 
 def _name(number: int) -> str:
-    return f"{FOLDER}/{number:09d}.json"
-
-
-def _hash(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    return f"{FOLDER}/{plan_name(number)}"
 
 
 def _first_writable(places: Sequence[str]) -> str:
@@ -154,4 +181,4 @@ def _first_writable(places: Sequence[str]) -> str:
                 return place
         elif not Path(place, CONTRACT_FILE).exists() and (Path(place, FOLDER).is_dir() or os.access(place, os.W_OK)):
             return place
-    return str(default_folder("XDG_STATE_HOME", ".local/state") / "plans" / _hash("\n".join(places)))
+    return str(plans_folder() / hash_of("\n".join(places)))

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rlservo.export.contract.contract import version_key
-from rlservo.export.contract.errors import (
+from rlservo.bundle.contract import version_key
+from rlservo.errors import (
     BundleError,
     ConflictError,
     RefusedError,
@@ -23,12 +23,12 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
-from rlservo.serve_app.repository.repository import Key
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.repository.repository import Key, Listing
+from rlservo.serve_app.versions.deployment_plan import Loadable, Plan, PolicyPlan, ServedConfig
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_commands import Command, Load, Poll, agrees, differences, first_policies
 from rlservo.serve_app.versions.plan_files import PlanFiles
-from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import Loadable, Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
 logger = logging.getLogger(__name__)
@@ -53,6 +53,7 @@ class PlanFollower:
     def __init__(self, loader: VersionLoader, files: PlanFiles) -> None:
         self.store: PolicyStore | None = None
         self.plan: Plan | None = None
+        self.recent: tuple[Plan, ...] = ()  # the plan and some before it, the newest first
         self.loader = loader
         self.files = files
         self._failed: dict[Loadable, RlservoError] = {}  # why this process serves something older than the plan
@@ -60,6 +61,7 @@ class PlanFollower:
         self._refused_until: dict[Loadable, float] = {}  # new versions that polling leaves out for a while
         self._tried_at = 0.0
         self._config = ServedConfig()  # which versions polling may load
+        self._listing = Listing()  # of the last look
 
     @property
     def behind(self) -> tuple[str, ...]:
@@ -91,6 +93,7 @@ class PlanFollower:
                 self.files.place,
                 plan.changed_by,
             )
+        await self.files.call(self.files.note_places)
         await self._apply(plan)
 
     async def give(self, command: Command, name: str) -> Plan:
@@ -130,10 +133,13 @@ class PlanFollower:
             policies = before.policies if command is None else command.change(before, name)
             if policies == before.policies and before.generation:
                 return before
-            await self.loader.prove(policies, before.policies if before.generation else {})
+            notes = await self.loader.prove(policies, before.policies if before.generation else {})
             plan = before.after(policies, "configuration" if command is None else command.line(name))
             try:
                 if await self.files.call(self.files.create, plan):
+                    if command is not None:
+                        command.notes[:] = notes
+                    await self.files.call(self.files.note_places)
                     return plan
             except UnavailableError as error:
                 if before.generation:
@@ -158,7 +164,8 @@ class PlanFollower:
 
     async def _unwritten(self) -> Plan:
         """Return the plan before the first, which is not written."""
-        return Plan(generation=0, policies=first_policies(self._config, await self.loader.look()))
+        self._listing = await self.loader.look()
+        return Plan(generation=0, policies=first_policies(self._config, self._listing))
 
     def _generation(self) -> int:
         if self.plan is None:
@@ -176,13 +183,34 @@ class PlanFollower:
         if plan is not None:
             await self._apply(plan)
 
-    async def warn_of_newer(self) -> None:
-        """Log which versions are newer than the plan's, and not loaded."""
-        with contextlib.suppress(Exception):  # the repository may be out of reach
-            if newer := self._newer((await self.loader.look()).digests):
-                shown = ", ".join(" ".join(key) for key in newer[:10])
-                newest = f"newer than the versions of plan {self._generation()}, and not loaded: {shown}"
-                logger.warning("%s (`rlservo policy load`)", newest)
+    @property
+    def has_looked(self) -> bool:
+        """Whether it has read what its repository holds."""
+        return bool(self._listing.digests)
+
+    async def look(self) -> set[str]:
+        """Look for bundles that are not served; return a sentence for each. Raises UnavailableError."""
+        self._listing = await self.loader.look()
+        return set(self.not_served())
+
+    def not_loaded(self) -> dict[str, list[str]]:
+        """Return the versions that the repository held at the last look and the plan does not load, by policy."""
+        policies = {} if self.plan is None else self.plan.policies
+        left = {
+            name: [each for each in versions if name not in policies or each not in policies[name].versions]
+            for name, versions in sorted(self._listing.digests.items())
+        }
+        return {name: versions for name, versions in left.items() if versions}
+
+    def not_served(self) -> list[str]:
+        """Return a sentence for each bundle that no operator has left out, with the command that loads it."""
+        policies = {} if self.plan is None else self.plan.policies
+        return [
+            f"{name} version {version} is not served: the plan is older (rlservo policy load {name} {version})"
+            for name, versions in self.not_loaded().items()
+            for version in versions
+            if self._may_load(name) and (name not in policies or version not in policies[name].unloaded)
+        ]
 
     async def load_newer(self) -> set[str]:
         """Load versions newer than all that the plan knows of a policy, as the command `load` does; return the faults.
@@ -208,13 +236,18 @@ class PlanFollower:
         policies = {} if self.plan is None else self.plan.policies
         newer: list[Key] = []
         for name, versions in sorted(digests.items()):
-            listed, known = self._config.policies.get(name), policies.get(name)
-            if self._config.unlisted == "ignore" if listed is None else listed.versions is not None:
+            known = policies.get(name)
+            if not self._may_load(name):
                 continue
             before = [] if known is None else [version_key(each) for each in (*known.versions, *known.unloaded)]
             later = [(name, version) for version in versions if all(version_key(version) > each for each in before)]
             newer += later if known is not None else later[-1:]
         return newer
+
+    def _may_load(self, name: str) -> bool:
+        """Whether the configuration leaves a policy's versions to the repository."""
+        listed = self._config.policies.get(name)
+        return self._config.unlisted == "load" if listed is None else listed.versions is None
 
     def states(self) -> dict[str, dict[str, VersionState]]:
         """Return the state of every version that is served, should be, or was refused, by name."""
@@ -268,7 +301,12 @@ class PlanFollower:
         self.store = PolicyStore(kept.values(), serving, self.store)
         self.plan = plan
         self._failed = failed
+        self.recent = (plan,)
         if failed:
             logger.error("plan %d cannot be served as it should: %s", plan.generation, "; ".join(self.behind))
         else:
             logger.info("serving plan %d (%s)", plan.generation, plan.changed_by)
+        with contextlib.suppress(UnavailableError):  # an earlier plan is only shown
+            recent = await self.files.call(self.files.recent, plan)
+            if self.plan is plan:
+                self.recent = recent

@@ -1,8 +1,8 @@
 """Shadow versions: a candidate computes after the reply, and only its difference is kept.
 
-No request waits for it: requests beyond a full queue are skipped and counted. Exploring actions are not compared, since
-they differ by chance. The difference is the largest of |candidate - default| over an action's elements, in the action's
-own units; for discrete actions it is 0 or the distance of their numbers.
+No request waits for it: requests beyond a full queue are skipped and counted. Exploratory actions are not compared,
+since they differ by chance. The difference is the largest of |candidate - default| over an action's elements, in the
+action's own units; for discrete actions it is 0 or the distance of their numbers.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.versions.policy_store import Decision
+from rlservo.errors import RlservoError
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.versions.computing import Computing
+from rlservo.serve_app.versions.loaded_versions import Decision
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +63,8 @@ class Shadows:
             shadow, obs, decision = self.waiting.get()
             series = (decision.name, decision.version, shadow.contract.version)
             try:
-                differences = _differences(shadow.act(obs), decision.action, batch=decision.batch)
+                with Computing(decision.name, shadow.contract.version):
+                    differences = _differences(shadow.act(obs), decision.action, batch=decision.batch)
             except Exception as error:  # this thread serves every shadow and must survive a broken one
                 if not isinstance(error, RlservoError):  # as if its action left the space: a shadow is run to find that
                     logger.exception("shadow %s of policy '%s' failed", shadow.contract.version, decision.name)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import Future
-from typing import Any
 
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import BundleError, RlservoError
+from rlservo.bundle.compatibility import harmless_differences, interface_differences
+from rlservo.bundle.contract import Contract
+from rlservo.errors import BundleError, RlservoError
+from rlservo.policy.options import PolicyOptions
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.repository.places import TIMEOUT_S
 from rlservo.serve_app.repository.repository import Key, Listing, Repository, exchanged, raise_all
-from rlservo.serve_app.repository.storage import TIMEOUT_S
-from rlservo.serve_app.runtime.options import PolicyOptions
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
-from rlservo.serve_app.versions.serving_plan import Loadable, PolicyPlan
+from rlservo.serve_app.versions.computing import Computing
+from rlservo.serve_app.versions.deployment_plan import Loadable, PolicyPlan
+
+logger = logging.getLogger(__name__)
 
 
 class VersionLoader:
@@ -81,8 +85,11 @@ class VersionLoader:
                 found[key] = error
         return found
 
-    async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> None:
-        """Load new versions of `policies` and those with an alias; check that canary and shadow fit the default one.
+    async def prove(self, policies: Mapping[str, PolicyPlan], before: Mapping[str, PolicyPlan]) -> list[str]:
+        """Load new versions of `policies` and those with an alias; check that clients can use those they will get.
+
+        A moved alias leads to a version that fits the one before, canary and shadow fit the default one. Returns what
+        differs without harm, a sentence for each.
 
         Raises BundleError or UsageError with every version that cannot be served, and UnavailableError if they only
         could not be read, or not in time.
@@ -94,8 +101,11 @@ class VersionLoader:
             wanted += [(n, v, d) for n, v, d in policy.loadables(name) if known.get(v) != d or v in relied_on]
         found = await self.load_all(wanted)
         raise_all({key[:2]: each for key, each in found.items() if isinstance(each, RlservoError)})
+        notes: list[str] = []
         for name, policy in changed.items():
-            await self._check_companions(name, policy)
+            notes += await self._check_successors(name, policy, before.get(name, PolicyPlan()))
+            notes += await self._check_companions(name, policy)
+        return notes
 
     def _load_accepted(self, name: str, version: str, digest: str) -> Policy:
         """Load the bundle that was accepted, in a thread."""
@@ -103,7 +113,8 @@ class VersionLoader:
         given = {} if options is None else {"options": options}
         with self._repository.fetch(name, version, digest) as folder:
             try:
-                policy = self._load_bundle(folder, **given)
+                with Computing(name, version):
+                    policy = self._load_bundle(folder, **given)
             except MemoryError:
                 raise BundleError(f"{folder} needs more memory than there is") from None
             contract = policy.contract
@@ -112,29 +123,52 @@ class VersionLoader:
                 raise exchanged(name, version, folder)
         return policy
 
-    async def _check_companions(self, name: str, policy: PolicyPlan) -> None:
-        """Refuse a canary or shadow whose observations or actions differ from the default version's."""
+    async def _check_successors(self, name: str, policy: PolicyPlan, before: PolicyPlan) -> list[str]:
+        """Refuse an alias that moves to a version which clients of the one before cannot use."""
+        notes = []
+        for alias, version in policy.aliases.items():
+            was = before.aliases.get(alias, version)
+            if was == version or was not in before.versions:
+                continue
+            successor = await self.load((name, version, policy.versions[version]))
+            try:
+                predecessor = await self.load((name, was, before.versions[was]))
+            except RlservoError as error:  # it must not keep its alias
+                logger.warning("the successor of policy '%s' version %s is not checked: %s", name, was, error.message)
+                continue
+            if wrong := interface_differences(successor.contract, predecessor.contract):
+                raise BundleError(
+                    f"policy '{name}' version {version} cannot take the alias '{alias}' from version {was}, whose "
+                    f"clients could not use it: {wrong}. Serve it under another name, or stop them, unload the policy "
+                    "and load this version"
+                )
+            notes += _note(successor.contract, predecessor.contract)
+        return notes
+
+    async def _check_companions(self, name: str, policy: PolicyPlan) -> list[str]:
+        """Refuse a canary or shadow that clients of the default version could not use."""
+        notes = []
         for role in ("canary", "shadow"):
             version = policy.version_of(policy.uses.get(f"the {role}", ""))
             if version is None or policy.default is None:
                 continue
             both = [await self.load((name, each, policy.versions[each])) for each in (version, policy.default)]
             theirs, ours = (each.contract for each in both)
-            if _interface(theirs) != _interface(ours):
-                wrong = "its observations or actions have other names, types or shapes"
+            if different := interface_differences(theirs, ours):
+                wrong = different
             elif role == "canary" and theirs.state != ours.state:
                 wrong = "its recurrent state has other names, types or shapes"
             elif role == "shadow" and theirs.state:
                 wrong = "it remembers its episode, and a shadow computes on single observations"
             else:
+                notes += _note(theirs, ours)
                 continue
             raise BundleError(
                 f"policy '{name}' version {version} cannot be the {role} of version {policy.default}: {wrong}"
             )
+        return notes
 
 
-def _interface(contract: Contract) -> tuple[Any, ...]:
-    """Return the tensors of a policy that its callers must know."""
-    inputs = tuple(tensor for tensor in contract.inputs if not tensor.name.startswith("state_in."))
-    actions = tuple(tensor for tensor in contract.outputs if tensor.name.split(".")[0] == "action")
-    return inputs, actions
+def _note(contract: Contract, known: Contract) -> list[str]:
+    different = harmless_differences(contract, known)
+    return [f"version {contract.version} differs from {known.version}: {different}"] if different else []

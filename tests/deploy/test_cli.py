@@ -18,12 +18,13 @@ from typing import Any
 import pytest
 
 from command_line import rlservo, rlservo_here
+from rlservo.bundle.bundle import load_bundle, read_contract
+from rlservo.bundle.spaces import BoxSpec, Element
 from rlservo.deploy.commands.environment_options import parse_env_arguments
-from rlservo.export.contract.bundle import load_bundle, read_contract
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.spaces import BoxSpec, Element
-from rlservo.serve_app.runtime.compiled_policy import CompiledPolicy
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.errors import UsageError
+from rlservo.policy.compiled_policy import CompiledPolicy
+from rlservo.policy.policy import Policy
+from servers import free_ports
 
 ROOT = Path(__file__).resolve().parents[2]
 UR5 = ROOT / "examples" / "checkpoints" / "ur5_positioning"
@@ -76,7 +77,9 @@ def test_export_as_json_prints_one_document(exported: subprocess.CompletedProces
     document = json.loads(exported.stdout)
     assert Path(document["path"]).is_dir()
     assert 0 < document["seconds"] < 300 and 50 < document["peak_memory_mb"] < 5000
-    assert document["contract"]["observation_space"]["elements"][0] == {"name": "target_r", "unit": "m"}
+    assert document["contract"]["observation_space"]["elements"][0] == {
+        "name": "target_r", "unit": "m", "quantity": "distance", "frame": "tool0"
+    }  # fmt: skip
     assert document["contract"]["control_rate_hz"] == 10.0
 
 
@@ -87,10 +90,19 @@ def test_all_modules_of_a_checkpoint_behind_a_uri_are_exported_as_one_list(tmp_p
     assert Path(document["path"]) == tmp_path / "end-effector-positioning-ur" / "1"
     assert f"loading {UR5.as_uri()}: checkpoints are pickles" in done.stderr
     refused(
-        rlservo_here("export", UR5, "--out", tmp_path, "--all-modules", "--module-id", "default_policy"),
+        rlservo_here("export", UR5, "--out", tmp_path, "--all-modules", "--module-id", "m", "--output", "a=b"),
         2,
-        "--all-modules exports every module: leave --module-id and --agent-id out",
+        "--all-modules exports every module: leave --module-id and --output out",
     )
+
+
+@pytest.mark.parametrize(
+    "option", ["--vecnormalize=a.pkl", "--frame-stack=4", "--joint-order=a", "--action-range=-1,1", "--output=a=action"]
+)
+def test_option_of_another_source_is_refused(tmp_path: Path, option: str) -> None:
+    done = rlservo_here("export", UR5, "--out", tmp_path / "out", option)
+    refused(done, 2, f"{option.split('=')[0]} is not for rllib checkpoints: leave it out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_exporting_twice_makes_the_next_version(tmp_path: Path) -> None:
@@ -197,9 +209,9 @@ def test_rollout_replay_and_the_cockpit_drive_the_compiled_policy(compiled: Path
     done = rlservo_here("replay", run, "--bundle", compiled, "--json")
     assert done.returncode == 0, done.stdout + done.stderr  # no action would change
     assert json.loads(done.stdout)["compared"] > 0
-    from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link
+    from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, ServerLink
 
-    with BundledPolicies(compiled).open(Choice("ur5", "1"), Link()) as policy:
+    with BundledPolicies(compiled).open(Choice("ur5", "1"), ServerLink()) as policy:
         assert isinstance(policy, CompiledPolicy)
 
 
@@ -302,13 +314,25 @@ def test_every_command_has_help_with_an_example() -> None:
         assert "Example" in done.stdout
 
 
+@pytest.mark.parametrize("words", [("list",), ("load", "ur5"), ("promote", "ur5", "2", "--max-error-rate", "1%")])
+def test_a_server_that_is_down_is_the_fault_not_a_missing_key(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.delenv("RLSERVO_ADMIN_KEY", raising=False)
+    (port,) = free_ports(1)
+    done = rlservo_here("policy", *words, "--url", f"http://127.0.0.1:{port}", cwd=tmp_path)
+    assert f"http://127.0.0.1:{port} cannot be reached" in done.stderr and "`rlservo serve`" in done.stderr
+    assert done.returncode != 0 and "admin key" not in done.stderr
+
+
 def test_serve_refuses_a_default_policy_that_is_not_served(policies: Path) -> None:
     done = rlservo("serve", policies, "--default-policy", "mir100")
     refused(done, 2, "the default policy 'mir100' is not served: expected ur5")
     assert "starting" not in done.stderr
 
 
-HEAVY = {"asyncio", "fastapi", "grpc", "gymnasium", "httpcore", "httpx", "mujoco", "numpy", "onnxruntime", "ray",
+HEAVY = {"asyncio", "fastapi", "grpc", "gymnasium", "httptools", "httpx", "mujoco", "numpy", "onnxruntime", "ray",
          "rich", "starlette", "torch"}  # fmt: skip
 MODULES_OF = """
 import json, sys

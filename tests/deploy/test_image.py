@@ -64,6 +64,7 @@ def expression(pattern: str) -> re.Pattern[str]:
 def test_package_data_is_what_is_meant_and_nothing_that_lies_beside_it(checkout: Path) -> None:
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, checkout)
+    shutil.copytree(ROOT / "rlservo", checkout / "rlservo", symlinks=True)  # it links to the others
     for folder in ("envs", "export", "serve_app"):
         (checkout / folder).symlink_to(ROOT / folder)
     program = """
@@ -77,7 +78,7 @@ print(*(f"{folder}/{name}" for package, folder, _, names in build.data_files if 
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=checkout)
     assert done.returncode == 0, done.stderr
-    packed = {line.removeprefix("deploy/") for line in done.stdout.splitlines()}
+    packed = {line.removeprefix("./rlservo/deploy/") for line in done.stdout.splitlines()}
     there = {
         str(file.relative_to(checkout / "deploy"))
         for folder in (".", "compose", "kuberay")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import configparser
 import copy
 import json
+import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -16,10 +19,12 @@ import pytest
 import yaml
 from compose_spec import PyCompose
 
+from documents import HOW_TO, blocks
 from rayservice_schema import POD_MONITOR, RAY_SERVICE
-from rlservo.serve_app.server.api_keys import Keys
+from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
-from rlservo.serve_app.versions.serving_plan import ServedConfig
+from rlservo.serve_app.versions.deployment_plan import ServedConfig
+from servers import free_ports, running
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 KUBERAY = DEPLOY / "kuberay"
@@ -219,20 +224,54 @@ def test_compose_is_well_formed_and_no_linter_finds_a_serious_fault() -> None:
 
 def test_compose_publishes_nginx_alone_and_every_service_is_confined_and_watched() -> None:
     compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
-    assert set(compose["services"]) == {"server", "nginx", "store", "store-volume", "prometheus", "grafana"}
+    lasting = {"server", "nginx", "store", "prometheus", "grafana"}
+    once = {"store-volume", "bucket", "publish"}
+    assert set(compose["services"]) == lasting | once
     assert compose["networks"]["inside"] == {"internal": True}
     owner = compose["services"].pop("store-volume")  # root, for one call of chown
     assert (owner["cap_drop"], owner["cap_add"], owner["network_mode"]) == (["ALL"], ["CHOWN"], "none")
     for name, service in compose["services"].items():
         assert ("ports" in service) == (name == "nginx"), name
         assert (service["networks"] == ["inside"]) == (name != "nginx")
-        assert service["read_only"] and service["cap_drop"] == ["ALL"] and "healthcheck" in service
+        assert service["read_only"] and service["cap_drop"] == ["ALL"]
+        assert ("healthcheck" in service, service["restart"]) == (
+            (name in lasting),
+            ("no" if name in once else "unless-stopped"),
+        )
         assert service["user"].partition(":")[0] not in ("", "0", "root")
         assert service["image"].rpartition(":")[2] not in ("", "latest")
         for volume in service.get("volumes", []):
             source = volume.split(":")[0]
-            assert source in compose["volumes"] or (DEPLOY / source).is_file(), source
+            assert source in compose["volumes"] or source == "../policies" or (DEPLOY / source).is_file(), source
         assert set(service.get("secrets", [])) <= set(compose["secrets"])
+
+
+def test_compose_has_a_way_to_the_first_bundle_and_its_page_makes_every_secret(tmp_path: Path) -> None:
+    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    services, ended = compose["services"], {"condition": "service_completed_successfully"}
+    assert services["publish"]["depends_on"] == services["server"]["depends_on"] == {"bucket": ended}
+    assert services["nginx"]["depends_on"] == ["server"]  # which may wait for its first bundle
+    assert "mb --ignore-existing store/policies" in services["bucket"]["command"][0]
+    assert services["publish"]["command"][-1] == services["server"]["command"][2] == "s3://policies"
+    assert services["publish"]["environment"].items() <= services["server"]["environment"].items()
+    (block,) = [each.text for each in blocks(HOW_TO / "compose-and-tls.md") if "deploy/secrets\n" in each.text]
+    path = {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "-euc", block], cwd=tmp_path, env=os.environ | path, check=True, capture_output=True)
+    made = tmp_path / "deploy" / "secrets"
+    assert made.stat().st_mode & 0o777 == 0o700
+    for name, secret in compose["secrets"].items():
+        file = made / name
+        assert secret["file"] == f"./secrets/{name}" and file.stat().st_mode & 0o777 == 0o444 and file.stat().st_size
+    keys = Keys.from_settings(ServerSettings(api_keys_file=str(made / "api_keys")))
+    assert [(key.label, key.role.name) for key in keys.keys] == [
+        ("cell-7", "act"), ("prometheus", "act"), ("operator", "admin")
+    ]  # fmt: skip
+    prometheus = keys.find((made / "prometheus_key").read_bytes().strip())
+    assert prometheus is not None and prometheus.label == "prometheus"
+    s3 = configparser.ConfigParser()
+    s3.read(made / "s3_credentials")
+    stored = {name: (made / name).read_text().strip() for name in ("store_user", "store_password")}
+    assert [*s3["default"].values()] == [stored["store_user"], stored["store_password"]]
 
 
 def test_grafana_finds_the_dashboard_where_it_looks() -> None:
@@ -265,3 +304,24 @@ def test_dockerfile_runs_as_somebody_without_rights_and_installs_pinned_versions
 def test_dashboard_is_in_json_and_its_uid_is_its_own() -> None:
     dashboard = json.loads((DEPLOY / "grafana.json").read_text())
     assert dashboard["uid"] == "rlservo"
+
+
+@pytest.mark.slow
+def test_systemds_unit_is_valid_and_its_command_serves(shipped: Path, tmp_path: Path) -> None:
+    """As systemd reads it, with a folder of its own in place of the machine's."""
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("there is no systemd-analyze here (Debian: apt-get install systemd)")
+    unit = tmp_path / "rlservo.service"
+    unit.write_text((DEPLOY / "rlservo.service").read_text().replace("/opt/rlservo/bin/rlservo", program("rlservo")))
+    done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+    service = configparser.ConfigParser(interpolation=None, strict=False)
+    service.read(unit)
+    keys = tmp_path / "keys"
+    keys.write_text(new_key("operator", admin=True)[1] + "\n")
+    name, _, _ = service["Service"]["Environment"].partition("=")
+    (port,) = free_ports(1)
+    command = service["Service"]["ExecStart"].replace(" policies ", f" {shipped / 'ur5'} ").split()
+    with running([*command, "--port", str(port)], port, **{name: str(keys)}) as server:
+        assert server.process.stdout is not None
+        assert any(line.startswith("ready") for line in server.process.stdout)

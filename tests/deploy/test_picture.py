@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from rlservo.deploy.demo import picture
-from rlservo.serve_app.rollout import video
-from rlservo.serve_app.rollout.control_loop import rollout
-from rlservo.serve_app.rollout.environment import make_env
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.drive import video
+from rlservo.drive.control_loop import rollout
+from rlservo.drive.make_environment import make_env
+from rlservo.policy.policy import Policy
 
 MIR100 = "rlservo/NoObstacleNavigationMir100Sim-v0"
 

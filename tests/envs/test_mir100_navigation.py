@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from rlservo.envs.checks import InvalidActionError, InvalidResetError
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.mir100.no_obstacle_navigation import NoObstacleNavigationMir100Sim
 from rlservo.envs.mir100.obstacle_avoidance import ObstacleAvoidanceMir100Sim
-from rlservo.envs.mir100.parameters import BACK_SCANNER, FRONT_SCANNER
+from rlservo.robots.checks import InvalidActionError, InvalidResetError
+from rlservo.robots.mir100.parameters import BACK_SCANNER, FRONT_SCANNER
 
 EMPTY_ID = "rlservo/NoObstacleNavigationMir100Sim-v0"
 LAB_ID = "rlservo/ObstacleAvoidanceMir100Sim-v0"

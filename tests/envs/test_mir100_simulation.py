@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from rlservo.envs.mir100.model import TIMESTEP
-from rlservo.envs.mir100.parameters import BACK_SCANNER, BODY_CENTRE, FRONT_SCANNER, LENGTH, MASS
-from rlservo.envs.mir100.simulation import Mir100Simulation
+from rlservo.robots.mir100.model import TIMESTEP
+from rlservo.robots.mir100.parameters import BACK_SCANNER, BODY_CENTRE, FRONT_SCANNER, LENGTH, MASS
+from rlservo.robots.mir100.simulation import Mir100Simulation
 
 # The lab's inner faces, from the world file: walls 0.15 m thick round 6 x 8 m, all of it moved by (-0.027, 0.014).
 EAST, WEST, NORTH, SOUTH = 2.85 - 0.027, -2.85 - 0.027, 3.85 + 0.014, -3.85 + 0.014

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from rlservo.envs.checks import InvalidActionError, InvalidResetError
 from rlservo.envs.panda.arm_env import EmptyEnvironmentPandaSim
 from rlservo.envs.panda.end_effector_positioning import EndEffectorPositioningPandaSim
-from rlservo.envs.panda.model import HIGH, LOW
-from rlservo.envs.panda.simulation import PandaSimulation
 from rlservo.envs.randomization import DomainRandomization
+from rlservo.robots.checks import InvalidActionError, InvalidResetError
+from rlservo.robots.panda.model import HIGH, LOW
+from rlservo.robots.panda.simulation import PandaSimulation
 
 EMPTY, POSITIONING = "rlservo/EmptyEnvironmentPandaSim-v0", "rlservo/EndEffectorPositioningPandaSim-v0"
 BOTH = pytest.mark.parametrize("env_id", [EMPTY, POSITIONING])

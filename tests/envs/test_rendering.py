@@ -10,8 +10,8 @@ from ctypes.util import find_library
 
 import pytest
 
+from rlservo.bundle.environment_id import NAMESPACE, importing_id
 from rlservo.envs.registration import ENTRY_POINTS
-from rlservo.export.contract.environment_id import NAMESPACE, importing_id
 
 WINDOW = """
 import sys

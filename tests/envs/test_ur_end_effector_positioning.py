@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from rlservo.envs.checks import InvalidActionError, InvalidResetError
 from rlservo.envs.ur.end_effector_positioning import EndEffectorPositioningURSim
-from rlservo.envs.ur.parameters import UR_PARAMETERS
+from rlservo.robots.checks import InvalidActionError, InvalidResetError
+from rlservo.robots.ur.parameters import UR_PARAMETERS
 
 ENV_ID = "rlservo/EndEffectorPositioningURSim-v0"
 START = [0.0, -2.5, 1.5, -1.5, -1.4, 0.0]

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from rlservo.envs.ur.isaac_reach import DEFAULT_JOINTS, IsaacReachURSim, quaternion_of, rotation_of
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.robots.ur.simulation import URSimulation
 
 ID = "rlservo/IsaacReachURSim-v0"
 TWO_PI = 2 * math.pi

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from rlservo.envs.checks import InvalidActionError, InvalidResetError
 from rlservo.envs.ur.basic_avoidance import BasicAvoidanceURSim
 from rlservo.envs.ur.empty_environment import EmptyEnvironmentURSim
-from rlservo.envs.ur.parameters import UR_PARAMETERS
+from rlservo.robots.checks import InvalidActionError, InvalidResetError
+from rlservo.robots.ur.parameters import UR_PARAMETERS
 
 # robo-gym's bounds: three elements of BasicAvoidance are always zero.
 pytestmark = pytest.mark.filterwarnings("ignore:.*A Box observation space maximum and minimum values are equal")

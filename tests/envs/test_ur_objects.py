@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from rlservo.envs.ur.object_paths import interpolate, object_path
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.robots.ur.object_paths import interpolate, object_path
+from rlservo.robots.ur.simulation import URSimulation
 
 START = np.array([0.0, -2.5, 1.5, -1.5, -1.4, 0.0])
 BOX = {"x_min": -1.0, "x_max": 1.0, "y_min": -1.0, "y_max": 1.0, "z_min": 0.1, "z_max": 1.0}

@@ -8,10 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from rlservo.envs.ur.model import BASE_HEIGHT
-from rlservo.envs.ur.parameters import UR_PARAMETERS, URParameters, cycle_of
 from rlservo.envs.ur.server_state import state_dict
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.robots.ur.model import BASE_HEIGHT
+from rlservo.robots.ur.parameters import UR_PARAMETERS, URParameters, cycle_of
+from rlservo.robots.ur.simulation import URSimulation
 
 MODELS = list(UR_PARAMETERS)
 START = np.array([0.0, -2.5, 1.5, -1.5, -1.4, 0.0])

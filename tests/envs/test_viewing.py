@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rlservo.envs.checks import InvalidResetError
 from rlservo.envs.rendering import RenderedEnv
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies, visible_shapes
+from rlservo.robots.checks import InvalidResetError
 
 IDS = (
     "EndEffectorPositioningURSim-v0",

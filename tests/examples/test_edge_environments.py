@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 pytestmark = pytest.mark.slow
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from shared.imitation import Imitation, fit_to_solution
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 
 SETTINGS: dict[str, Any] = {
     "env": "rlservo.envs:rlservo/EndEffectorPositioningPandaSim-v0",

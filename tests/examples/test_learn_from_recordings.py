@@ -15,11 +15,11 @@ import pytest
 
 from bundles import SHIPPED
 from rlservo.export.export_checkpoint import export_checkpoint
-from rlservo.serve_app.recording.episodes import Episode, episodes
-from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.recording.recorded_policy import WithRecording
-from rlservo.serve_app.replay.replay import replay
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
+from rlservo.recording.episodes import RecordedEpisode, episodes
+from rlservo.recording.reader import Recording
+from rlservo.recording.recorded_policy import WithRecording
+from rlservo.recording.replay.replay import replay
 from trainings import OneRay
 
 UR5 = Path(__file__).resolve().parents[2] / "examples" / "checkpoints" / SHIPPED["ur5"]
@@ -27,7 +27,7 @@ SCRIPT = "learn_from_recordings.py"
 WHOLE = ("--epochs", "1", "--batch-size", "100000")  # one minibatch
 
 
-def record(bundle: Path, file: Path, *, explore: bool, lengths: tuple[int, ...] = (7, 23, 41)) -> list[Episode]:
+def record(bundle: Path, file: Path, *, explore: bool, lengths: tuple[int, ...] = (7, 23, 41)) -> list[RecordedEpisode]:
     """Episodes of random observations, the last one cut off."""
     rng = np.random.default_rng(0)
     with WithRecording(Policy.load(bundle), file) as policy:
@@ -82,7 +82,7 @@ def test_marwil_values_whole_episodes(one_ray: OneRay, shipped: Path, tmp_path: 
     assert losses(done.ended.out, "vf_loss") == pytest.approx([0.5 * np.square(errors).mean()], rel=1e-4)
 
 
-def value_errors(graph: onnxruntime.InferenceSession, episode: Episode, gamma: float) -> list[float]:
+def value_errors(graph: onnxruntime.InferenceSession, episode: RecordedEpisode, gamma: float) -> list[float]:
     assert episode.final_obs is not None
     seen = np.concatenate([episode.obs["obs"], episode.final_obs["obs"]])
     *values, after = np.asarray(graph.run(["value"], {"obs": seen})[0]).reshape(-1)

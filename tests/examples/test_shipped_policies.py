@@ -27,8 +27,8 @@ import yaml
 from bundles import EXPORTED_WITH, PRODUCT
 from cache import cached, versions
 from rlservo import errors, export_checkpoint
-from rlservo.export.contract.environment_id import plain_id
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.bundle.environment_id import plain_id
+from rlservo.policy.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SHIPPED = EXAMPLES / "checkpoints"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rlservo import errors
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 

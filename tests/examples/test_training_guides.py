@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from documents import HOW_TO, TUTORIAL, ran
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.bundle.spaces import BoxSpec
+from rlservo.policy.policy import Policy
 from trainings import OneRay
 
 pytestmark = pytest.mark.slow
@@ -27,7 +28,6 @@ def test_tutorial_runs_as_printed(tutorial: tuple[str, Path]) -> None:
     assert re.search(r"^\w+_00000 +1 +8,\d\d\d +-?\d", printed, re.MULTILINE)  # its first iteration
     assert list((folder / "runs" / "policies").glob("*/1/contract.json"))
     assert "production=2" in printed
-    assert re.search(r"^success$", printed, re.MULTILINE)
 
 
 def test_guide_to_training_runs_as_printed(one_ray: OneRay, tmp_path: Path) -> None:
@@ -35,6 +35,16 @@ def test_guide_to_training_runs_as_printed(one_ray: OneRay, tmp_path: Path) -> N
     assert printed.count("best checkpoint: ") == 2
     with Policy.load(tmp_path / "runs" / "policies" / "cart-pole" / "2") as policy:
         assert policy.contract.provenance.env_id == "CartPole-v1"
+
+
+def test_guide_to_ones_own_environment_runs_as_printed(one_ray: OneRay, tmp_path: Path) -> None:
+    alone = "export RAY_ADDRESS=local RAY_AUTH_MODE=disabled\n"  # not the cluster of other tests
+    printed = ran(HOW_TO / "your-own-environment.md", tmp_path, one_ray=one_ray, before=alone)
+    assert "reach.Scaled, your own" in printed and re.search(r"success +│ +\d+\.\d%", printed)
+    with Policy.load(tmp_path / "policies" / "reach") as policy:
+        assert policy.contract.control_rate_hz == 20.0
+        assert isinstance(policy.contract.observation_space, BoxSpec)
+        assert [element.name for element in policy.contract.observation_space.elements] == ["position", "velocity"]
 
 
 def test_guide_to_learning_runs_as_printed(one_ray: OneRay, tmp_path: Path) -> None:

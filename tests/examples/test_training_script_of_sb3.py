@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.rollout.control_loop import rollout
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.client.policy_client import PolicyClient
+from rlservo.drive.control_loop import rollout
+from rlservo.policy.policy import Policy
 from servers import launched
 
 pytest.importorskip("stable_baselines3")

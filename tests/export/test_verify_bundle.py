@@ -7,20 +7,23 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, ClassVar
 
 import gymnasium
+import numpy as np
 import pytest
 from gymnasium.envs.classic_control.pendulum import PendulumEnv
 from rich.console import Console
 
 from checkpoints import training_code
-from rlservo.export.contract.bundle import load_bundle, read_contract
-from rlservo.export.contract.errors import BundleError, ParityError, UsageError
-from rlservo.export.contract.spaces import BoxSpec, Element
+from rlservo.bundle.bundle import load_bundle, read_contract, write_contract
+from rlservo.bundle.spaces import BoxSpec, Element, leaf_specs
+from rlservo.errors import BundleError, ParityError, UsageError
 from rlservo.export.element_names import read_elements
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
 from rlservo.export.prune_checkpoint import prune_checkpoint
 from rlservo.export.recipe.recipe import Recipe
+from rlservo.export.recipe.to_contract import space_spec
 from rlservo.export.reports import contract_report
 from rlservo.export.verify_bundle import verify_bundle
 
@@ -145,6 +148,8 @@ def test_a_pruned_checkpoint_is_small_and_exports_to_the_same_policy(
     ours, theirs = (result.contract.model_dump(mode="json") for result in (pruned, whole))
     for one in (ours, theirs):
         one["provenance"].pop("exported_at")
+    how = [one["parity"].pop("reference") for one in (ours, theirs)]  # the copy holds no configuration
+    assert "as the checkpoint lists them" in how[0] and "builds them from the configuration" in how[1]
     assert ours == theirs
     size = sum((tmp_path / "small" / file).stat().st_size for file in kept)
     assert size < sum(file.stat().st_size for file in (zoo / name).rglob("*") if file.is_file()) / 2
@@ -181,7 +186,57 @@ def test_elements_come_from_the_environments_class(toy: str, notices: list[str])
 def test_elements_that_do_not_fit_stay_unnamed_with_a_notice(toy: str, notices: list[str]) -> None:
     names = read_elements(toy, {"spaces": "mixed"}, toy_recipe(obs=4), notices.append)
     assert names.observation == () and len(names.action) == 3
-    assert "names 5 observation elements, the policy has 4" in " ".join(notices)
+    assert "names 5 elements of 'obs', which has 4" in " ".join(notices)
+
+
+class Described(gymnasium.Env[Any, Any]):
+    """An environment with nested spaces, which describes them as `given` says."""
+
+    given: ClassVar[dict[str, Any]] = {}
+
+    @classmethod
+    def describe(cls) -> dict[str, Any]:
+        return cls.given
+
+
+gymnasium.register("Described-v0", Described)
+
+
+def nested_recipe() -> Recipe:
+    box, both = gymnasium.spaces.Box, gymnasium.spaces.Dict
+    inner = gymnasium.spaces.Tuple([box(-1, 1, (1,)), gymnasium.spaces.Discrete(3)])
+    obs = both({"arm": box(-1, 1, (2,)), "rest": inner})
+    return Recipe(obs, box(-1, 1, (1,)), (), "mean", "unsquash", "diag_gaussian")
+
+
+ARM = [{"name": "shoulder", "unit": "rad"}, {"name": "elbow", "unit": "rad"}]
+
+
+def test_parts_of_nested_spaces_are_named(notices: list[str]) -> None:
+    rest = [[{"name": "distance", "unit": "m"}], []]
+    Described.given = {"observation": {"arm": ARM, "rest": rest}, "action": [{"name": "speed"}], "control_rate_hz": 5}
+    names = read_elements("Described-v0", {}, nested_recipe(), notices.append)
+    assert isinstance(names.observation, dict) and notices == [] and names.control_rate_hz == 5.0
+    spec = space_spec(nested_recipe().observation_space, names.observation)
+    by_leaf = {name: [element.name for element in leaf.elements] for name, leaf in leaf_specs(spec, "obs").items()}
+    assert by_leaf == {"obs.arm": ["shoulder", "elbow"], "obs.rest.0": ["distance"], "obs.rest.1": []}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"arm": [*ARM, {"name": "wrist"}]}, "it names 3 elements of 'obs.arm', which has 2"),
+        ({"leg": ARM}, "'obs' has no part 'leg'"),
+        ({"arm": ["shoulder", "elbow"]}, "element 0 of 'obs.arm' is 'shoulder': expected {'name': ..., 'unit': ...}"),
+    ],
+)
+def test_one_wrong_part_leaves_the_others_named(notices: list[str], wrong: Any, says: str) -> None:
+    Described.given = {"observation": wrong, "action": [{"name": "speed"}], "control_rate_hz": 5}
+    names = read_elements("Described-v0", {}, nested_recipe(), notices.append)
+    assert names.observation == () and [each.name for each in names.action] == ["speed"]  # type: ignore[union-attr]
+    assert names.control_rate_hz == 5.0
+    (notice,) = notices
+    assert notice.endswith(says) and "does not describe its observation, which changes nothing else" in notice
 
 
 @pytest.mark.parametrize("env_id", ["No/Such-v0", "nowhere:Env", "toy"])
@@ -208,7 +263,8 @@ def test_the_report_shows_names_bounds_baked_steps_and_proof(
     file = io.StringIO()
     Console(width=width, file=file).print(contract_report(contract))
     shown = file.getvalue()
-    for words in ("sin_angle", "rad/s", "mean_std_filter", "unsquash", "Pendulum-v1", "torchscript", "795", "PPO"):
+    samples = str(kept.parity.samples)
+    for words in ("sin_angle", "rad/s", "mean_std_filter", "unsquash", "Pendulum-v1", "torchscript", samples, "PPO"):
         assert words in shown, words
     assert max(len(line) for line in shown.splitlines()) <= width
     assert "-8 " in shown and "gaussian" in shown
@@ -250,3 +306,33 @@ def test_long_element_names_with_units_and_a_filter_fit_eighty_columns(
     for index, one in enumerate(ROBOT_NAMES):
         assert [str(index), one, "rad/s", "-6.283", "6.283", "-123.5", "0.001234"] in rows
     assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80
+
+
+def test_verify_looks_for_bounds_that_samples_seldom_reach(tmp_path: Path, notices: list[str]) -> None:
+    """A policy beyond its bound for three observations in ten thousand, and a bundle that lost the bound."""
+    sb3 = pytest.importorskip("stable_baselines3")
+    onnx = pytest.importorskip("onnx")
+    space = gymnasium.spaces.Box(-1, 1, (1,))
+    env = pytest.importorskip("stable_baselines3.common.envs").IdentityEnvBox()
+    env.observation_space = env.action_space = space
+    model = sb3.PPO("MlpPolicy", env, policy_kwargs={"net_arch": [2]}, device="cpu", seed=0)
+    weights = model.policy.state_dict()
+    width = 3e-4  # tanh(x - a) - tanh(x - b): a peak between a and b
+    weights["mlp_extractor.policy_net.0.weight"][:] = 5.0 / width
+    weights["mlp_extractor.policy_net.0.bias"][:] = (
+        5.0 / width * weights["mlp_extractor.policy_net.0.bias"].new_tensor([-0.3 + width, -0.3 - width])
+    )
+    weights["action_net.weight"][:] = weights["action_net.weight"].new_tensor([[0.75, -0.75]])
+    model.policy.load_state_dict(weights)
+    model.save(tmp_path / "model")
+    bundle = export_checkpoint(tmp_path / "model.zip", tmp_path / "out", notify=notices.append).path
+    verify_bundle(bundle, tmp_path / "model.zip", notify=notices.append)
+
+    graph = onnx.load(bundle / "policy.onnx")
+    (clip,) = (node for node in graph.graph.node if node.op_type == "Clip")
+    (upper,) = (node for node in graph.graph.node if node.output[0] == clip.input[2])
+    upper.attribute[0].t.CopyFrom(onnx.numpy_helper.from_array(np.float32(2.0)))
+    onnx.save(graph, bundle / "policy.onnx")
+    write_contract(bundle, read_contract(bundle))
+    with pytest.raises(ParityError):
+        verify_bundle(bundle, tmp_path / "model.zip", notify=notices.append)

@@ -17,16 +17,17 @@ import httpx
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import UnavailableError
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.protocols.open_inference.messages import messages
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.client.policy_client import PolicyClient
+from rlservo.client.stream_client import StreamClient
+from rlservo.errors import UnavailableError
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from servers import ROOT, LiveServer, free_ports
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
 CONFIGURATION = ROOT / "deploy" / "compose" / "nginx.conf"
+PREFIXED = ROOT / "deploy" / "nginx_prefix.conf"
 OBS = np.random.default_rng(3).standard_normal(27).astype(np.float32)
 
 
@@ -72,6 +73,8 @@ def behind(live_server: LiveServer, tmp_path_factory: pytest.TempPathFactory) ->
     (port,) = free_ports(1)
     text = CONFIGURATION.read_text().replace(" /tmp/", f" {folder}/")
     for ours, theirs in (
+        ("    location / {\n", f"{PREFIXED.read_text()}    location / {{\n"),
+        ("http://127.0.0.1:8000/;", f"http://127.0.0.1:{live_server.port}/;"),
         ("listen 8443 ssl", f"listen 127.0.0.1:{port} ssl"),
         ("server server:8000;", f"server 127.0.0.1:{live_server.port};"),
         ("server server:8001;", f"server 127.0.0.1:{live_server.grpc_port};"),
@@ -119,6 +122,13 @@ def test_a_stream_acts_through_tls_as_in_process(trusted: Behind, ur5: Path) -> 
     with Policy.load(ur5) as policy, StreamClient(trusted.url, "ur5", api_key=trusted.key, timeout_s=60) as client:
         for factor in (0.5, 1.0, 2.0):
             np.testing.assert_array_equal(client.act(OBS * factor), policy.act(OBS * factor))
+
+
+def test_clients_act_below_a_prefix(trusted: Behind, ur5: Path) -> None:
+    with Policy.load(ur5) as policy:
+        for kind in (PolicyClient, StreamClient):
+            with kind(f"{trusted.url}/robots", "ur5", api_key=trusted.key, timeout_s=60) as client:
+                np.testing.assert_array_equal(client.act(OBS), policy.act(OBS))
 
 
 def test_grpc_acts_through_tls_as_in_process(trusted: Behind, ur5: Path) -> None:

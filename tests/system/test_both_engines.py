@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -17,13 +18,14 @@ import numpy as np
 import pytest
 
 from clusters import KEY, Cluster
-from loads import Load
-from rlservo.export.contract.errors import ObservationError, UnauthenticatedError
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.protocols.open_inference.messages import messages
-from rlservo.serve_app.runtime.policy import Policy
+from loads import Load, busiest
+from rlservo.client.policy_client import PolicyClient
+from rlservo.client.stream_client import StreamClient
+from rlservo.errors import ObservationError, UnauthenticatedError
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from servers import LiveServer
+from waiting import wait_for
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
@@ -239,3 +241,39 @@ def test_a_replica_that_is_killed_is_replaced_and_its_clients_ask_another(cluste
         time.sleep(2)
     cluster.wait_for_status("RUNNING")
     assert load.asked > 50 and (load.wrong, load.failures) == (0, [])
+
+
+def test_a_replica_that_dies_is_logged_by_its_successor_with_the_version_it_was_computing(
+    cluster: Cluster, slow_policy: Callable[..., Path]
+) -> None:
+    action = Policy.load(slow_policy(cluster.repository, version="9")).act(OBS)
+    load = Load(cluster.port, "ur5", OBS.tolist(), [np.asarray(action)], api_key=KEY, pause_s=0.0, version="9")
+
+    def logged() -> set[str]:
+        files = list(cluster.folder.rglob("worker-*.err"))
+        return {line for file in files for line in file.read_text(errors="replace").splitlines() if "died" in line}
+
+    with cluster.admin() as admin:
+        admin.load("ur5", "9")
+    loaded: dict[str, bool] = {}
+
+    def is_loaded() -> bool:
+        """Return whether both replicas have it, by a connection for each look."""
+        with cluster.admin() as admin:
+            listing = admin.listing()
+        (ur5,) = [each for each in listing["policies"] if each["name"] == "ur5"]
+        loaded[listing["replica"]] = "9" in ur5["versions"]
+        return [*loaded.values()] == [True, True]
+
+    wait_for(is_loaded)
+    with load.run():
+        time.sleep(2)
+        killed = busiest(cluster.replica_pids())
+        os.kill(killed, signal.SIGKILL)
+        wait_for(lambda: killed not in (now := cluster.replica_pids()) and len(now) == 2)
+        wait_for(lambda: any(f"process {killed}) died" in line for line in logged()))
+    cluster.wait_for_status("RUNNING")
+    assert any("died while computing version 9 of policy 'ur5'" in line for line in logged())
+    with cluster.admin() as admin:
+        admin.unload("ur5", "9")
+    shutil.rmtree(cluster.repository / "ur5" / "9")

@@ -20,12 +20,20 @@ from ros import PYTHON, Ros
 
 RAY = HOW_TO / "ray-and-kubernetes.md"
 CARTPOLE = ROOT / "examples" / "checkpoints" / "cartpole_dqn"
-# The first two are run by robo-gym's Python, in tests/system/test_robo_gym_client.py, the three that train in
+# The first is run by robo-gym's Python, in tests/system/test_robo_gym_client.py, the four that train in
 # tests/examples/test_training_guides.py. The others need more than a folder with policies.
-ELSEWHERE = {"robo-gym", "real-arm", "train", "learn", "learn-online", "export", "sources", "ur-arm", "ros2", RAY.stem}
+ELSEWHERE = {"robo-gym", "train", "learn", "learn-online", "export", "sources", "ur-arm", "ros2",
+             "your-own-environment", RAY.stem}  # fmt: skip
 REAL_ARM = """
-rlservo ur-controller --model ur5e --host 192.168.0.2 > arm.txt 2>&1 &
+(echo slider 0.1; exec sleep 100000) | rlservo ur-controller --model ur5e --host 192.168.0.2 > arm.txt 2>&1 &
 until grep -q Ctrl-C arm.txt; do sleep 0.2; done
+python -c '
+import rtde_control
+arm = rtde_control.RTDEControlInterface("192.168.0.2")
+arm.moveJ([0.5, -2.2, 1.5, -1.2, -1.4, 0.3], 3.0, 3.0)  # away from the start pose
+arm.stopScript()
+arm.disconnect()
+'
 """
 READY = "curl -sf --retry 300 --retry-delay 1 --retry-all-errors http://127.0.0.1:8000/v2/health/ready\n"
 GUIDES = [page for page in pages() if page not in (README, TUTORIAL) and page.stem not in ELSEWHERE]
@@ -123,11 +131,13 @@ def test_guide_to_sources_runs_as_printed(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_guide_to_a_real_arm_runs_as_printed(folder: Path) -> None:
-    """The arm at the page's address is simulated."""
+    """The arm at the page's address is simulated, its slider at 10%; it stands 0.5 rad away from the start pose."""
     pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
     with own_machine(folder, "192.168.0.2") as machine:
         printed = ran(HOW_TO / "ur-arm.md", folder, machine, before=REAL_ARM)
     assert "The policy must pass:" in printed
+    assert "at the present speed scaling of 10%" in printed
+    assert re.search(r"success: 1\b", printed), printed
 
 
 @pytest.mark.slow

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
-from loads import CLIENTS, Load
-from rlservo.export.contract.errors import BundleError, UsageError
+from loads import CLIENTS, Load, busiest
+from rlservo.errors import BundleError, UsageError
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.engines.uvicorn_server import serve_policies
-from rlservo.serve_app.runtime.policy import Policy
 from servers import Run, ask, free_ports, launched, running, wait_until_served
 from waiting import wait_for
 
@@ -57,8 +59,11 @@ def test_a_port_that_is_taken_is_named_with_its_holder(policies: Path) -> None:
 @pytest.mark.parametrize("workers", [1, 2])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_server_that_is_ended_leaves_nothing(policies: Path, number: signal.Signals, workers: int) -> None:
-    with launched(policies, workers=workers, with_admin_key=number != signal.SIGKILL, with_grpc=True) as run:
+    # With one process nothing is left that could remove the key's file: the next server replaces it.
+    with_key = workers > 1 or number != signal.SIGKILL
+    with launched(policies, workers=workers, with_admin_key=with_key, with_grpc=True) as run:
         run.wait_until_ready()
+        assert run.key_file is None or run.key_file.exists()
         assert run.end(number) == (-signal.SIGKILL if number == signal.SIGKILL else 0)
 
 
@@ -197,3 +202,67 @@ def test_workers_whose_parent_was_killed_end_themselves(policies: Path) -> None:
         run.process.kill()
         run.process.wait()
         wait_for(lambda: not any(map(psutil.pid_exists, left)))
+
+
+@pytest.mark.serve
+def test_workers_leave_the_key_of_the_server_that_followed_theirs(policies: Path) -> None:
+    with launched(policies, workers=2, with_admin_key=True) as run:
+        run.wait_until_ready()
+        assert run.key_file is not None
+        run.key_file.write_text("rls_of-a-later-server\n")
+        run.process.kill()
+        run.process.wait()
+        wait_for(lambda: not run.left(), "the workers' end")
+        assert run.key_file.read_text() == "rls_of-a-later-server\n"
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+@pytest.mark.parametrize("waited_s", [0.0, 2.0])  # the second: in the health check of a worker that does not answer
+def test_a_server_with_stopped_workers_ends_as_one_without(policies: Path, waited_s: float) -> None:
+    with launched(policies, workers=3) as run:
+        run.wait_until_ready()
+        for pid in worker_pids(run):
+            os.kill(pid, signal.SIGSTOP)
+        time.sleep(waited_s)
+        began = time.monotonic()
+        assert run.end(signal.SIGTERM) == 0
+        print(f"ended in {time.monotonic() - began:.1f} s")
+        assert time.monotonic() - began < 15
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_a_worker_that_dies_is_logged_with_the_signal_and_the_version_it_was_computing(
+    slow_policy: Callable[..., Path], tmp_path: Path
+) -> None:
+    slow, log = slow_policy(tmp_path / "policies", version="3"), tmp_path / "server.log"
+
+    def deaths() -> list[str]:
+        lines = map(json.loads, log.read_text().splitlines())
+        return [line["message"] for line in lines if line["level"] == "error" and "replaced" in line["message"]]
+
+    def serving() -> list[int]:
+        """The workers, if both serve."""
+        text = ask(run.port, "GET", "/metrics")[1].decode()
+        pids = [int(pid) for pid in re.findall(r'rlservo_plan_generation{replica="(\d+)"}', text)]
+        return pids if sorted(pids) == worker_pids(run) and len(pids) == 2 else []
+
+    with launched(slow, workers=2, settings={"log_file": str(log)}) as run:
+        run.wait_until_ready()
+        load = Load(run.port, "ur5", OBS, [Policy.load(slow).act(OBS)], pause_s=0.0)
+        signals = (signal.SIGFPE, signal.SIGSEGV, signal.SIGKILL)
+        with load.run():
+            for number, signum in enumerate(signals, start=1):
+                pids = wait_for(serving)
+                time.sleep(1)
+                os.kill(busiest(pids), signum)
+                wait_for(lambda number=number: len(deaths()) == number)
+        idle = wait_for(serving)[0]
+        os.kill(idle, signal.SIGSEGV)
+        wait_for(lambda: len(deaths()) == 4)
+        assert run.end(signal.SIGTERM) == 0
+    for sentence, signum in zip(deaths(), signals, strict=False):
+        assert f"was ended by signal {signum.value} " in sentence
+        assert "while computing version 3 of policy 'ur5'" in sentence
+    assert deaths()[3].startswith(f"worker {idle} was ended by signal 11 ") and "computing nothing" in deaths()[3]

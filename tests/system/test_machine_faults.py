@@ -13,8 +13,8 @@ import grpc
 import pytest
 
 from namespaces import in_own_namespace
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.client.policy_client import PolicyClient
+from rlservo.client.stream_client import StreamClient
 from servers import ROOT, launched
 
 pytestmark = pytest.mark.serve

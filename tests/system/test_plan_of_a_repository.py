@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
-from rlservo.export.contract.errors import ConflictError
-from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.wire.admin_key_file import read_key
+from rlservo.client.admin_client import AdminClient
+from rlservo.client.formats.admin_key_file import read_key
+from rlservo.errors import ConflictError
 from servers import Run, ask, launched
 from waiting import wait_for
 

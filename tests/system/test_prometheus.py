@@ -10,7 +10,7 @@ import subprocess
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,14 @@ import numpy as np
 import pytest
 import yaml
 
-from rlservo.export.contract import bundle as bundle_files
-from rlservo.export.contract.contract import BakedStep
-from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.bundle import bundle as bundle_files
+from rlservo.bundle.contract import BakedStep
+from rlservo.client.stream_client import StreamClient
+from rlservo.errors import RlservoError
+from rlservo.policy.drift import EVERY
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.runtime.drift import EVERY
 from rlservo.serve_app.server.settings import ServerSettings
-from servers import ROOT, LiveServer, ask, free_ports
+from servers import ROOT, LiveServer, ask, free_ports, launched
 from stores import control_of, load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -132,14 +132,21 @@ def prometheus(
     promtool: str, live_server: LiveServer, drifting: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Prometheus]:
     folder = tmp_path_factory.mktemp("prometheus")
-    (folder / "key").write_text(live_server.key)
+    with scraping(folder, live_server.key, live_server.port, drifting) as running:
+        yield running
+
+
+@contextmanager
+def scraping(folder: Path, key: str, *ports: int) -> Iterator[Prometheus]:
+    """Run a Prometheus with the configuration that compose uses, for these ports of this machine."""
+    (folder / "key").write_text(key)
     configuration = yaml.safe_load((DEPLOY / "compose" / "prometheus.yaml").read_text())
     (job,) = configuration["scrape_configs"]
     assert configuration["rule_files"] and job["authorization"]["credentials_file"] and job["static_configs"]
     configuration["global"] = {"scrape_interval": "250ms", "evaluation_interval": "250ms", "scrape_timeout": "250ms"}
     configuration["rule_files"] = [str(DEPLOY / "alerts.yaml")]
     job["authorization"]["credentials_file"] = str(folder / "key")
-    job["static_configs"] = [{"targets": [f"127.0.0.1:{live_server.port}", f"127.0.0.1:{drifting}"]}]
+    job["static_configs"] = [{"targets": [f"127.0.0.1:{each}" for each in ports]}]
     job["scrape_timeout"] = job["scrape_interval"] = "2s"  # a busy machine
     (folder / "prometheus.yaml").write_text(yaml.safe_dump(configuration))
     (port,) = free_ports(1)
@@ -188,11 +195,18 @@ def test_every_query_of_the_dashboard_has_series(scraped: Prometheus, expression
     assert scraped.query(asked), asked
 
 
+ONE_OF_OURS = "last_over_time(rlservo_uptime_seconds[1h])"
+
+
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule["alert"])
 def test_every_alert_looks_at_series_that_are_there(scraped: Prometheus, rule: dict[str, Any]) -> None:
     expression = rule["expr"]
     if (absent := re.fullmatch(r"absent\((.*)\)", expression)) is not None:
         assert scraped.query(expression) == [] and scraped.query(absent[1])
+        return
+    if rule["alert"] == "RlservoServerDown":
+        assert scraped.query(expression) == []
+        assert scraped.query(f"up == 1 and on (job, instance) {ONE_OF_OURS}") and ONE_OF_OURS in expression
         return
     drawn = THRESHOLD.sub("", expression)
     assert drawn != expression
@@ -207,3 +221,23 @@ def test_prometheus_took_the_rules_and_only_what_is_so_is_pending_or_fires(scrap
     scraped.wait_for('ALERTS{alertname="RlservoObservationsFarFromTraining"}')
     about = {each["metric"]["alertname"] for each in scraped.query("ALERTS")}
     assert not about & {"RlservoNoReplica", "RlservoKeyFileUnusable"}
+
+
+def test_two_embedded_servers_are_two_and_the_one_that_dies_is_named(
+    promtool: str, policies: Path, tmp_path: Path
+) -> None:
+    (unrelated,) = free_ports(1)
+    with launched(policies) as first, launched(policies, workers=2) as second:
+        for run in (first, second):
+            run.wait_until_ready()
+        with scraping(tmp_path, "", first.port, second.port, unrelated) as prometheus:
+            one, other = (f"127.0.0.1:{run.port}" for run in (first, second))
+            prometheus.wait_for("count(group by (instance) (rlservo_uptime_seconds)) == 2")
+            (keys,) = [rule["expr"] for rule in RULES if rule["alert"] == "RlservoKeyFileUnusable"]
+            shown = prometheus.query(keys.replace("== 0", ">= 0"))
+            assert sorted(each["metric"]["instance"] for each in shown) == sorted([one, other, other])
+            assert prometheus.query('ALERTS{alertname="RlservoServerDown"}') == []
+            first.process.kill()
+            down = prometheus.wait_for('ALERTS{alertname="RlservoServerDown"}')
+            assert [each["metric"]["instance"] for each in down] == [one]
+            assert prometheus.query(f'up{{instance="127.0.0.1:{unrelated}"}}')[0]["value"][1] == "0"

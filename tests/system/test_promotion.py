@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,10 +21,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import RlservoError
-from rlservo.serve_app.client.admin_client import AdminClient
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.promotion_evidence import PLAN, read_metrics
+from rlservo.client.admin_client import AdminClient
+from rlservo.client.policy_client import PolicyClient
+from rlservo.client.promotion_evidence import PLAN, read_metrics
+from rlservo.errors import RlservoError
 from servers import Run, free_ports, running, wait_until_served
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -62,13 +64,18 @@ class Server:
     def wait_until_all_follow(self, plan: int) -> None:
         deadline = time.monotonic() + PATIENCE_S
         with self.admin() as admin:
-            while [each[PLAN] for each in read_metrics(admin.metrics(), "ur5").values()] != [plan] * WORKERS:
+            while [each[PLAN] for each in running_workers(admin).values()] != [plan] * WORKERS:
                 assert time.monotonic() < deadline
                 time.sleep(0.1)
 
     def workers(self) -> list[int]:
         with self.admin() as admin:
-            return [int(pid) for pid in read_metrics(admin.metrics(), "ur5") if pid]
+            return [int(pid) for pid in running_workers(admin)]
+
+
+def running_workers(admin: AdminClient) -> dict[str, dict[str, float]]:
+    """The numbers of each worker; those that have ended, whose counts stay for a while, have no plan."""
+    return {pid: each for pid, each in read_metrics(admin.metrics(), "ur5").items() if PLAN in each}
 
 
 @pytest.fixture(scope="module")
@@ -212,11 +219,56 @@ def test_ctrl_c_ends_the_canary_and_sigterm_leaves_it(server: Server, tmp_path: 
         assert server.serves(*left)
 
 
-def test_a_worker_that_dies_meanwhile_costs_no_promotion(server: Server, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGFPE, signal.SIGKILL])  # as onnxruntime dies of a division
+def test_a_version_on_trial_whose_worker_dies_is_rolled_back(
+    server: Server, tmp_path: Path, number: signal.Signals
+) -> None:
     log = tmp_path / "log.jsonl"
-    with loaded(server) as load, promoting(server, log, "2", "--for", "10s") as process:
-        wait_for_checks(process, log, 2)
-        os.kill(server.workers()[0], signal.SIGKILL)
+    with loaded(server) as load, promoting(server, log, "2", "--for", "10m", "--every", "5") as process:
+        wait_for_checks(process, log, 1)
+        os.kill(server.workers()[0], number)  # and its successor is ready long before the next look
         code, said = outcome_of(process)
+    assert code == 1 and f"1 of {server.url}'s workers died while version 2 was on trial" in said, said
+    assert server.serves("1", None) and load.versions["2"] > 0
+
+
+def test_workers_that_are_replaced_in_order_cost_no_promotion_and_lose_no_counts(
+    server: Server, tmp_path: Path
+) -> None:
+    log = tmp_path / "log.jsonl"
+    with loaded(server) as load, promoting(server, log, "2", "--for", "40s", "--every", "5") as process:
+        wait_for_checks(process, log, 1)
+        before = set(server.workers())
+        server.run.process.send_signal(signal.SIGHUP)
+        code, said = outcome_of(process)
+        assert before - set(server.workers())
     assert code == 0, said
-    assert server.serves("2", None) and load.versions["2"] > 30
+    assert server.serves("2", None)
+    counted = int(re.findall(r"failed requests: 0 of ([0-9,]+)", said)[0].replace(",", ""))
+    assert counted <= load.versions["2"]  # which goes on after the decision
+    (last,) = [line for line in map(json.loads, log.read_text().splitlines()) if line["event"] == "decision"]
+    answered = last["counts"]["total"]["rlservo_request_seconds_bucket/2/+Inf"]
+    assert answered >= 0.9 * counted and load.failures == []
+
+
+def test_a_server_of_one_process_that_dies_and_is_started_again_is_evidence(versions: Path, tmp_path: Path) -> None:
+    repository, (port,) = Path(shutil.copytree(versions, tmp_path / "policies")), free_ports(1)
+    command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(repository), "--port", str(port),
+               "--alias", "ur5:production=1"]  # fmt: skip
+    runtime, plans = tmp_path / "runtime", str(tmp_path / "plans")
+    runtime.mkdir()
+    keys = {"RLSERVO_PLAN": plans, "XDG_RUNTIME_DIR": str(runtime)}
+    with contextlib.ExitStack() as stack:
+        first = stack.enter_context(running(command, port, **keys))
+        wait_until_served(first)
+        (key_file,) = runtime.rglob("*.key")
+        server, log = Server(first, key_file), tmp_path / "log.jsonl"
+        with promoting(server, log, "2", "--for", "10m", "--every", "10") as process:
+            wait_for_checks(process, log, 1)
+            os.kill(first.processes("rlservo.deploy.cli serve")[0], signal.SIGFPE)
+            first.process.wait(PATIENCE_S)
+            again = stack.enter_context(running(command, port, **keys))
+            wait_until_served(again)
+            (server.key_file,) = runtime.rglob("*.key")
+            code, said = outcome_of(process)
+        assert code == 1 and "has started again while version 2 was on trial" in said, said

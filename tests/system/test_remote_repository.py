@@ -25,7 +25,7 @@ RLSERVO = [sys.executable, "-m", "rlservo.deploy.cli"]
 
 
 def test_published_versions_are_served_also_when_the_storage_is_away(storage: Storage, tmp_path: Path) -> None:
-    from rlservo.export.contract.bundle import load_bundle
+    from rlservo.bundle.bundle import load_bundle
     from rlservo.serve_app.repository.publication import publish
 
     publish(load_bundle(write_box_policy(tmp_path, version="1", seed=1)), storage.uri)

@@ -13,9 +13,9 @@ import pytest
 
 from bundles import SHIPPED
 from command_line import rlservo_here
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.rollout.control_loop import rollout
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.client.policy_client import PolicyClient
+from rlservo.drive.control_loop import rollout
+from rlservo.policy.policy import Policy
 from servers import ShippedServer
 
 ROOT = Path(__file__).resolve().parents[2]

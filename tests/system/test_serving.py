@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 from servers import LiveServer, ask
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

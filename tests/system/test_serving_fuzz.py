@@ -25,7 +25,7 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
-from rlservo.serve_app.protocols.open_inference.messages import messages
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 

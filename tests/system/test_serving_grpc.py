@@ -16,13 +16,13 @@ import grpc
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
+from rlservo.policy.policy import Policy
+from rlservo.recording.episodes import episodes
+from rlservo.recording.reader import Recording
 from rlservo.serve_app.engines.uvicorn_server import serve_policies
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc, is_local
-from rlservo.serve_app.protocols.open_inference.messages import messages
-from rlservo.serve_app.recording.episodes import episodes
-from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from servers import free_ports, launched
 from stores import control_of, load_store
 
@@ -65,6 +65,19 @@ def test_what_grpc_decides_is_recorded(live_server: Any, call: Call, ur5: Path) 
     np.testing.assert_array_equal(mine[0].action["action"].tobytes(), reply.raw_output_contents[0])
     with Policy.load(ur5) as policy:
         np.testing.assert_array_equal(mine[0].action["action"], policy.act(OBS[:1]))
+
+
+@pytest.mark.parametrize("place", ["input", "output"])
+def test_parameters_of_tensors_and_outputs_are_bounded(call: Call, place: str) -> None:
+    asked = request(OBS[:1])
+    asked.raw_input_contents.append(OBS[:1].tobytes())
+    of = asked.inputs[0] if place == "input" else asked.outputs.add(name="action")
+    for number in range(50_000):
+        of.parameters[f"{number}"].bool_param = True
+    with pytest.raises(grpc.RpcError) as caught:
+        call("ModelInfer", asked, messages.ModelInferResponse)
+    assert caught.value.code() == grpc.StatusCode.RESOURCE_EXHAUSTED
+    assert caught.value.details() == "the message has more than 1000 parameters"
 
 
 def request(obs: Any, **fields: Any) -> Any:
@@ -279,7 +292,7 @@ def test_a_taken_grpc_port_is_said_before_anything_starts(policies: Path) -> Non
 def test_messages_leave_the_process_wide_pool_alone() -> None:
     """KServe's and Triton's packages register `inference.*` there."""
     code = (
-        "import rlservo.serve_app.protocols.open_inference.messages\n"
+        "import rlservo.serve_app.protocols.open_inference.oip_messages\n"
         "from google.protobuf import descriptor_pool\n"
         "try: descriptor_pool.Default().FindMessageTypeByName('inference.ModelInferRequest')\n"
         "except KeyError: print('free')"

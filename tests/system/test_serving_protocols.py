@@ -11,7 +11,7 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 from servers import LiveServer, ask, exchange
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import DeadlineError, SessionLostError, UnavailableError
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.stream_client import StreamClient
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.client.policy_client import PolicyClient
+from rlservo.client.stream_client import StreamClient
+from rlservo.errors import DeadlineError, SessionLostError, UnavailableError
+from rlservo.policy.policy import Policy
 from servers import LiveServer, launched
 from storages import RedisServer
 

@@ -86,23 +86,31 @@ def test_any_worker_answers_for_both(server: Run) -> None:
     assert by_replica(server, "rlservo_policy_loaded", policy="ur5") == dict.fromkeys(counted, 1.0)
 
 
-def test_a_worker_that_dies_takes_its_series_and_files_with_it(server: Run) -> None:
-    act(server, 20)
-    killed, other = wait_for(lambda: workers(server), lambda seen: len(seen) == 2)
-    answered = by_replica(server, "rlservo_request_seconds_count").get(other, 0)
-    os.kill(int(killed), signal.SIGKILL)
+def test_counts_of_a_worker_that_dies_stay_and_its_death_is_counted(server: Run) -> None:
+    act(server, 60)
+    killed, _ = wait_for(lambda: workers(server), lambda seen: len(seen) == 2)
+    answered = by_replica(server, "rlservo_request_seconds_count")
+    assert max(by_replica(server, "rlservo_workers_lost_total").values()) == 0
+    os.kill(int(killed), signal.SIGFPE)
     wait_for(lambda: workers(server), lambda seen: killed not in seen and len(seen) == 2)
-    assert by_replica(server, "rlservo_request_seconds_count")[other] >= answered
+    left = by_replica(server, "rlservo_request_seconds_count")
+    assert all(left[worker] >= count for worker, count in answered.items())
+    assert max(by_replica(server, "rlservo_workers_lost_total").values()) == 1
     names = [path.name for path in server.folder.rglob("*.db")]
-    assert names and not any(killed in name for name in names)
+    assert names and not any(name.startswith("gauge") and killed in name for name in names)
 
 
 def test_workers_that_are_replaced_one_by_one_are_all_seen(server: Run) -> None:
     before = wait_for(lambda: workers(server), lambda seen: len(seen) == 2)
+    answered_before = sum(by_replica(server, "rlservo_requests_total", code="ok").values())
+    lost = by_replica(server, "rlservo_workers_lost_total")
     server.process.send_signal(signal.SIGHUP)
     after = wait_for(lambda: workers(server), lambda seen: len(seen) == 2 and not seen.keys() & before.keys())
     act(server, 40)
     answered = wait_for(
-        lambda: by_replica(server, "rlservo_requests_total", code="ok"), lambda seen: sum(seen.values()) == 40
+        lambda: by_replica(server, "rlservo_requests_total", code="ok"),
+        lambda seen: sum(seen.values()) == answered_before + 40,
     )
-    assert answered.keys() <= after.keys()
+    assert sum(count for worker, count in answered.items() if worker in after) == 40
+    now = by_replica(server, "rlservo_workers_lost_total")
+    assert max(now.values()) == max(lost.values())  # an orderly end is none

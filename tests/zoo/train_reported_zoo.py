@@ -49,6 +49,21 @@ def ppo(obs: str, action: str, *before: Any, model: Any = SMALL, module: Any = N
     return config.rl_module(model_config=model)
 
 
+def out_of_order(module: Any) -> Any:
+    """One agent of an environment for several, whose observations reach the network as they are."""
+    config = PPOConfig().environment("out_of_order").env_runners(num_env_runners=0)
+    config.training(train_batch_size=32, minibatch_size=16, num_epochs=1)
+    specs = {"robot": RLModuleSpec(module_class=module) if module else RLModuleSpec(model_config=SMALL)}
+    config.rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs=specs))
+    if not module:
+        config.env_runners(env_to_module_connector=pieces(lambda: FlattenObservations(multi_agent=True)))
+    return config.multi_agent(policies=set(specs), policy_mapping_fn=robot_is_robot)
+
+
+def robot_is_robot(*_: Any, **__: Any) -> str:
+    return "robot"
+
+
 def without_critic() -> Any:
     return FlattenObservations(zoo_reported.OBSERVATIONS["privileged"], keys_to_remove=["critic"])
 
@@ -99,6 +114,9 @@ def configurations() -> dict[str, Any]:
         "asymmetric": ppo("privileged", "box", module=zoo_reported.Asymmetric),
         "partly_read": ppo("partly_read", "discrete", module=zoo_reported.PartReader),
         "removed_key": ppo("privileged", "box", without_critic),
+        "in_order": ppo("unsorted", "discrete", module=zoo_reported.InOrder),
+        "out_of_order": out_of_order(zoo_reported.InOrder),
+        "out_of_order_flat": out_of_order(None),
         "infinite_buffers": ppo("vector", "discrete", module=zoo_reported.Masked),
         "image_lstm": ppo("image", "box", model=IMAGE_LSTM),
         "unusual": ppo("unusual", "box", flat),
@@ -114,6 +132,7 @@ def configurations() -> dict[str, Any]:
 def main(out: Path, only: list[str]) -> None:
     tune.register_env("reported", zoo_reported.Reported)
     tune.register_env("team", zoo_team.Team)
+    tune.register_env("out_of_order", zoo_reported.OutOfOrder)
     with ray_for_training():
         for name, config in configurations().items():
             if only and name not in only:
@@ -124,7 +143,7 @@ def main(out: Path, only: list[str]) -> None:
             if name == "self_play":
                 add_snapshot(algorithm)
             algorithm.save_to_path(str(out / name))
-            if name == "self_play":
+            if name.startswith(("self_play", "out_of_order")):
                 for agent, seen in team_rollout(algorithm.env_runner).items():
                     np.savez(out / f"{name}_{agent}.npz", **seen)
             elif name != "external":

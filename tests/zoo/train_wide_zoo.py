@@ -202,16 +202,16 @@ def team_rollout(runner: Any) -> dict[str, dict[str, Any]]:
 
     def reset(**kwargs: Any) -> Any:
         obs, info = real_reset(**kwargs)
-        last.update(obs=leaves(obs, "obs"), restart=True)
+        last.update(obs={agent: leaves(one, "obs") for agent, one in obs.items()}, restart=True)
         return obs, info
 
     def step(action: Any) -> Any:
         for agent, rows in seen.items():
             if last:
                 chosen = np.copy(action[agent])
-                rows.append({"obs": last["obs"][f"obs.{agent}"], "action": chosen, "restart": last["restart"]})
+                rows.append({**last["obs"][agent], "action": chosen, "restart": last["restart"]})
         result = real_step(action)
-        last.update(obs=leaves(result[0], "obs"), restart=False)
+        last.update(obs={agent: leaves(one, "obs") for agent, one in result[0].items()}, restart=False)
         return result
 
     env.reset, env.step = reset, step

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rlservo.envs.rendering import Camera
+from rlservo.envs.robot_server.robot_server_settings import ArmSettings
 from rlservo.envs.robot_server.robots.robot import RobotState
-from rlservo.envs.robot_server.settings import ArmSettings
-from rlservo.envs.ur.object_paths import object_path
-from rlservo.envs.ur.parameters import cycle_of
-from rlservo.envs.ur.simulation import SETTLE_CYCLES, VIEW, ArmSimulation
+from rlservo.robots.ur.object_paths import object_path
+from rlservo.robots.ur.parameters import cycle_of
+from rlservo.robots.ur.simulation import SETTLE_CYCLES, VIEW, ArmSimulation
 
 ROUNDING = 1e-5  # [rad], by which a float32 may exceed a limit
 Simulation = TypeVar("Simulation", bound=ArmSimulation)
@@ -98,7 +98,7 @@ class ArmRobot(ABC, Generic[Simulation]):
             if not math.isfinite(value):
                 raise ValueError(f"the action for {joint} is {value:g}: expected a finite number [{unit}]")
         if sim.stopped_by is not None:
-            raise ValueError(f"the robot has stopped ({sim.stopped_by}): SetState connects again")
+            raise ValueError(f"the robot has stopped ({sim.stopped_by}): SetState asks at the server's terminal")
         target = np.array([action[index] for index in self.ORDER])
         if mode == "delta_pos":
             target += sim.joint_positions

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rlservo.envs.mir100.parameters import BEAM_COUNT, CYCLE_S
-from rlservo.envs.mir100.simulation import ROOM_VIEW, Mir100Simulation
 from rlservo.envs.rendering import Camera
+from rlservo.envs.robot_server.robot_server_settings import Mir100Settings
 from rlservo.envs.robot_server.robots.robot import RobotState
-from rlservo.envs.robot_server.settings import Mir100Settings
+from rlservo.robots.mir100.parameters import BEAM_COUNT, CYCLE_S
+from rlservo.robots.mir100.simulation import ROOM_VIEW, Mir100Simulation
 
 STATE_LENGTH = 8 + BEAM_COUNT + 1 + 9
 TARGET, ROBOT, CUBES = slice(0, 3), slice(3, 6), slice(9 + BEAM_COUNT, STATE_LENGTH)

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from rlservo.envs.panda.arm_env import PandaArmEnv
-from rlservo.envs.panda.model import HIGH, LOW
 from rlservo.envs.panda.server_state import STATE_JOINTS, state_dict, state_names
-from rlservo.envs.panda.simulation import PandaSimulation
+from rlservo.envs.robot_server.robot_server_settings import PandaSettings
 from rlservo.envs.robot_server.robots.arm import ArmRobot
-from rlservo.envs.robot_server.settings import PandaSettings
-from rlservo.envs.ur.parameters import cycle_of
+from rlservo.robots.panda.model import HIGH, LOW
+from rlservo.robots.panda.simulation import PandaSimulation
+from rlservo.robots.ur.parameters import cycle_of
 
 
 class PandaRobot(ArmRobot[PandaSimulation]):

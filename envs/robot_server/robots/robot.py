@@ -22,7 +22,7 @@ class RobotState:
     string_params: Mapping[str, str] = field(default_factory=dict)
 
 
-class Robot(Protocol):
+class ServedRobot(Protocol):
     """A robot, simulated or real. Every method raises ValueError for an impossible request."""
 
     @property

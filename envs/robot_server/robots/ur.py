@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from rlservo.envs.robot_server.robot_server_settings import URSettings
 from rlservo.envs.robot_server.robots.arm import ArmRobot
-from rlservo.envs.robot_server.settings import URSettings
-from rlservo.envs.robots.arm import MUJOCO
-from rlservo.envs.robots.connect import make_arm
-from rlservo.envs.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.envs.ur.rs_modes import ROS_ORDER, state_names
 from rlservo.envs.ur.server_state import state_dict
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.robots.arm_interface import MUJOCO
+from rlservo.robots.connect_arm import make_arm
+from rlservo.robots.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
+from rlservo.robots.ur.simulation import URSimulation
 
 INITIAL_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
 # A list that is not one of our states has the positions after six other numbers, as in robo-gym's first versions.

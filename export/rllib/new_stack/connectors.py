@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
 
+from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.location import CheckpointFiles
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.recipe.recipe import (
     Flatten,
     FrameStack,
@@ -28,7 +28,7 @@ from rlservo.export.recipe.recipe import (
 )
 from rlservo.export.recipe.trees import space_leaves
 from rlservo.export.rllib import private_names
-from rlservo.export.rllib.frozen_filter import frozen_filter
+from rlservo.export.rllib.mean_std_filter import frozen_filter
 
 # Pieces that move data about without changing a number.
 PLUMBING = frozenset({
@@ -93,7 +93,7 @@ def read_observation_steps(env_to_module: Any, files: CheckpointFiles, slot: Age
                 f"the env-to-module connector {name} comes after {batched_by}, which has already passed the "
                 "observation on: what RLlib does then depends on the previous step, which is not exported"
             )
-        if is_batched or (name in BATCHES_OBSERVATION and _comes_from_rllib(type(piece))):
+        if is_batched or (name in BATCHES_OBSERVATION and comes_from_rllib(type(piece))):
             batched_by = name
         if step is not None:
             steps.append(step)
@@ -111,12 +111,12 @@ def read_action_steps(module_to_env: Any, action_space: Any) -> tuple[Transform,
     steps: list[UserStep] = []
     for piece in module_to_env.connectors:
         kind = type(piece)
-        if kind.__name__ == "NormalizeAndClipActions" and _comes_from_rllib(kind):
+        if kind.__name__ == "NormalizeAndClipActions" and comes_from_rllib(kind):
             if piece.normalize_actions:
                 transform = "unsquash"
             elif piece.clip_actions:
                 transform = "clip"
-        elif kind.__name__ not in PLUMBING or not _comes_from_rllib(kind):
+        elif kind.__name__ not in PLUMBING or not comes_from_rllib(kind):
             if transform != "none":
                 raise UnsupportedError(
                     f"the module-to-env connector {kind.__name__} ({kind.__module__}) comes after the actions have "
@@ -135,7 +135,7 @@ def read_action_steps(module_to_env: Any, action_space: Any) -> tuple[Transform,
 def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> ObservationStep | None:
     """Return an env-to-module piece's step (None: no effect), and freeze the piece."""
     kind = type(piece)
-    if not _comes_from_rllib(kind):
+    if not comes_from_rllib(kind):
         return _user_step(piece, "env-to-module", "the network would see other numbers")
     space = slot.part(piece.input_observation_space)
     if kind.__name__ == "MeanStdFilter":
@@ -219,6 +219,6 @@ def _filter(piece: Any, space: Any, slot: AgentSlot) -> ObservationFilter:
     return frozen_filter(private_names.get(piece, "_filters")[slot.agent])
 
 
-def _comes_from_rllib(kind: type) -> bool:
+def comes_from_rllib(kind: type) -> bool:
     """Return whether a piece is RLlib's own or does the same, and not the user's of the same name."""
     return kind.__module__ == BATCHED_CONNECTORS or kind.__module__.startswith("ray.rllib.connectors.")

@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rlservo.errors import UnsupportedError
 from rlservo.export.checkpoints.location import CTOR_FILE, weights_pickle
 from rlservo.export.checkpoints.older_rays import with_current_statistics
 from rlservo.export.checkpoints.unpickle import unpickle
-from rlservo.export.contract.errors import UnsupportedError
 from rlservo.export.rllib import private_names
 
 UNCHANGED = (2, 48)

@@ -7,28 +7,44 @@ as policy.py does.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.spaces import Space
 from ray.rllib.connectors.connector_pipeline_v2 import ConnectorPipelineV2
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
 from ray.rllib.env.multi_agent_episode import MultiAgentEpisode
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
+from rlservo.bundle.contract import BakedStep
+from rlservo.errors import AgentsDifferError, CheckpointError, UnsupportedError, first_line
 from rlservo.export.checkpoints.location import CheckpointFiles
 from rlservo.export.checkpoints.unpickle import unpickle
-from rlservo.export.contract.contract import BakedStep
-from rlservo.export.contract.errors import AgentsDifferError, CheckpointError, UnsupportedError
 from rlservo.export.recipe.describe import observation_step
-from rlservo.export.recipe.trees import Tree, build_like, map_tree, tree_leaves
+from rlservo.export.recipe.trees import Tree, build, build_in_order, build_like, map_tree, space_leaves, tree_leaves
 from rlservo.export.rllib import private_names
-from rlservo.export.rllib.new_stack.connectors import SINGLE_AGENT, AgentSlot, read_observation_steps
+from rlservo.export.rllib.new_stack.connectors import SINGLE_AGENT, AgentSlot, comes_from_rllib, read_observation_steps
+from rlservo.export.rllib.new_stack.watched import Watched, watch
 
 MAPPING = "AgentToModuleMapping"
+
+
+class NoInfo(dict[str, Any]):
+    """An environment's info, which no client sends: reading it raises UnsupportedError."""
+
+    def __init__(self) -> None:
+        super().__init__(info=None)  # RLlib replaces an empty one
+
+    def _refuse(self, *_args: Any, **_kwargs: Any) -> Any:
+        raise UnsupportedError("a connector reads the environment's info, which a served policy is not given")
+
+    __getitem__ = __contains__ = __iter__ = get = keys = values = items = _refuse
 
 
 @dataclass(frozen=True)
@@ -43,14 +59,41 @@ class Pipelines:
     connector_module: Any
     """Argument of RLlib's connectors: the module, or a MultiRLModule that holds it alone."""
 
-    def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return (the module's batch, the data that the pipelines share)."""
-        shared: dict[str, Any] = {}
+    def fresh(self) -> Pipelines:
+        """Return the same with connectors that remember nothing of what these are given."""
+        pipelines = (self.env_to_module, self.module_to_env)
+        pieces = [*pipelines, *(piece for pipeline in pipelines for piece in pipeline.connectors)]
+        spaces = [value for piece in pieces for value in vars(piece).values() if isinstance(value, Space)]
+        try:  # most of the time would go to the spaces, which nothing changes
+            env_to_module, module_to_env = copy.deepcopy(pipelines, {id(space): space for space in spaces})
+        except Exception as error:  # the user's own connectors may hold anything
+            raise UnsupportedError(
+                f"the connectors cannot be copied ({first_line(error)}), so no rollout of theirs can be repeated: keep "
+                "only data in them"
+            ) from error
+        for pipeline in (env_to_module, module_to_env):
+            called: list[Any] = [
+                piece if comes_from_rllib(type(piece)) else Watched(piece) for piece in pipeline.connectors
+            ]
+            pipeline.connectors = called
+        return dataclasses.replace(self, env_to_module=env_to_module, module_to_env=module_to_env)
+
+    @property
+    def has_own(self) -> bool:
+        """Whether there are connectors of the user's own."""
+        pieces = (*self.env_to_module.connectors, *self.module_to_env.connectors)
+        return not all(comes_from_rllib(type(piece)) for piece in pieces)
+
+    def to_module(self, episodes: list[Any], shared: dict[str, Any], **last: Any) -> dict[str, Any]:
+        """Return the module's batch.
+
+        `shared` is what connectors share in all steps of a rollout, `last` the last step's columns, a row an episode.
+        """
         with torch.no_grad():
-            batch = self.env_to_module(
-                rl_module=self.connector_module, batch={}, episodes=episodes, explore=False, shared_data=shared
+            batch: dict[str, Any] = self.env_to_module(
+                rl_module=self.connector_module, batch={}, episodes=episodes, explore=False, shared_data=shared, **last
             )
-        return batch, shared
+        return batch
 
     def forward(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Return the module's output for its batch, which it may change."""
@@ -66,15 +109,23 @@ class Pipelines:
             )
         return sent
 
+    def observation(self, leaves: Mapping[str, Any]) -> Any:
+        """Return an observation: Gymnasium's vector environments order its keys as the space does."""
+        return build(self.observation_space, [leaves[name] for name in space_leaves(self.observation_space, "obs")])
+
     def begin(self, obs: Any) -> Any:
         """Return an episode that has just been reset."""
         episode = SingleAgentEpisode(observation_space=self.observation_space, action_space=self.action_space)
-        episode.add_env_reset(observation=obs)
-        return episode
+        episode.add_env_reset(observation=obs, infos=NoInfo())
+        return watch(episode) if self.has_own else episode
 
     def advance(self, episode: Any, obs: Any, action: Any, reward: float, extra: dict[str, Any]) -> None:
         """Add a step to an episode."""
-        episode.add_env_step(observation=obs, action=action, reward=reward, extra_model_outputs=extra)
+        episode.add_env_step(observation=obs, action=action, reward=reward, infos=NoInfo(), extra_model_outputs=extra)
+
+    def column(self, values: list[Any]) -> list[Any]:
+        """Return one value for each environment in the form that an environment gives it."""
+        return values
 
 
 @dataclass(frozen=True)
@@ -83,10 +134,11 @@ class MultiAgentPipelines(Pipelines):
 
     slot: AgentSlot
 
-    def to_module(self, episodes: list[Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return (the module's batch, the data that the pipelines share)."""
-        batch, shared = super().to_module(episodes)
-        return batch[self.slot.module], shared
+    def to_module(self, episodes: list[Any], shared: dict[str, Any], **last: Any) -> dict[str, Any]:
+        """Return the module's batch."""
+        shared.setdefault("vector_env_episodes_map", {})
+        batch: dict[str, Any] = super().to_module(episodes, shared, **last)[self.slot.module]
+        return batch
 
     def to_env(self, given: dict[str, Any], episodes: list[Any], shared: dict[str, Any]) -> dict[str, Any]:
         """Return the agent's outputs for the environment and for the episodes."""
@@ -94,6 +146,10 @@ class MultiAgentPipelines(Pipelines):
         own = {name: [by_agent[self.slot.agent] for by_agent in rows] for name, rows in sent.items()}
         acting = (Columns.ACTIONS, Columns.ACTIONS_FOR_ENV)
         return {name: _stacked(rows) if name in acting else rows for name, rows in own.items()}
+
+    def observation(self, leaves: Mapping[str, Any]) -> Any:
+        """Return an observation with its keys in the order of `leaves`: RLlib leaves the environment's as it is."""
+        return build_in_order(self.observation_space, leaves)
 
     def begin(self, obs: Any) -> Any:
         """Return an episode that has just been reset."""
@@ -103,8 +159,8 @@ class MultiAgentPipelines(Pipelines):
             action_space=self.env_to_module.input_action_space,
             agent_to_module_mapping_fn=lambda _agent, _episode: module,
         )
-        episode.add_env_reset(observations={self.slot.agent: obs})
-        return episode
+        episode.add_env_reset(observations={self.slot.agent: obs}, infos={self.slot.agent: NoInfo()})
+        return watch(episode) if self.has_own else episode
 
     def advance(self, episode: Any, obs: Any, action: Any, reward: float, extra: dict[str, Any]) -> None:
         """Add a step to an episode."""
@@ -113,8 +169,13 @@ class MultiAgentPipelines(Pipelines):
             observations={agent: obs},
             actions={agent: action},
             rewards={agent: reward},
+            infos={agent: NoInfo()},
             extra_model_outputs={agent: extra},
         )
+
+    def column(self, values: list[Any]) -> list[Any]:
+        """Return one value for each environment in the form that an environment gives it."""
+        return [{self.slot.agent: value} for value in values]
 
 
 def pipelines_of(

@@ -29,6 +29,8 @@ from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from torch import Tensor, nn
 
+from rlservo.bundle.scores import Q_VALUES
+from rlservo.errors import CheckpointError, NoNetworkError, UnsupportedError, first_line
 from rlservo.export.checkpoints.facts import read_config
 from rlservo.export.checkpoints.location import (
     CTOR_FILE,
@@ -38,22 +40,24 @@ from rlservo.export.checkpoints.location import (
     weights_pickle,
 )
 from rlservo.export.checkpoints.unpickle import explain, unpickle
-from rlservo.export.contract.errors import CheckpointError, NoNetworkError, UnsupportedError, first_line
-from rlservo.export.contract.scores import Q_VALUES
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.samples import draw_pair
 from rlservo.export.recipe.trees import (
     Tree,
-    build,
     build_like,
     is_nested,
     map_tree,
     named_leaves,
-    space_leaves,
     tree_leaves,
 )
 from rlservo.export.rllib import private_names
+from rlservo.export.rllib.configuration import (
+    folder_of_connectors,
+    freeze,
+    read_algorithm_config,
+    restore_pipelines,
+)
 from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.new_stack.connectors import read_action_steps, read_observation_steps
@@ -65,8 +69,8 @@ from rlservo.export.rllib.new_stack.older_components import (
     saved_spaces,
     set_saved_state,
 )
-from rlservo.export.rllib.new_stack.pipelines import Pipelines, find_agent_slot, own_copy, pipelines_of
-from rlservo.export.rllib.restore_order import connectors_that_rllib_restores
+from rlservo.export.rllib.new_stack.pipelines import NoInfo, Pipelines, find_agent_slot, own_copy, pipelines_of
+from rlservo.export.rllib.new_stack.same_connectors import check_same
 from rlservo.export.rllib.supported_spaces import check_spaces
 from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
 
@@ -81,6 +85,12 @@ PIPELINE_SETTINGS = (
     "action_space",
 )
 """Settings of an algorithm that decide its connector pipelines (ray 2.60)."""
+LISTED = (
+    "RLlib's own connectors as the checkpoint lists them (without the algorithm's configuration, by which RLlib itself "
+    "restores them), inference forward and module-to-env connectors, observation filter frozen, exploration off"
+)
+ALONE = "RLlib's own default connectors around the RLModule alone and its inference forward, exploration off"
+"""The parity gate's reference where RLlib's own restore could not be repeated."""
 REFUSED_MODULES = {
     "DreamerV3TorchRLModule": "DreamerV3 draws its world model's state at random in every step, exploring or not, so "
     "no single action can prove an export",
@@ -89,7 +99,7 @@ REFUSED_MODULES = {
 QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn/default_dqn_rl_module.py
 
 
-class Network(nn.Module):
+class RLModuleNetwork(nn.Module):
     """RLlib's inference forward pass as a module that can be traced: network input to named tensors.
 
     If the module computes its actions itself, their leaves come first; a recurrent one's next state comes last.
@@ -139,18 +149,25 @@ class Network(nn.Module):
 
 
 class NewStackLoop:
-    """RLlib acting step after step, as `SingleAgentEnvRunner._sample` does it (ray 2.60): exploration off."""
+    """RLlib acting step after step, as `SingleAgentEnvRunner._sample` does it (ray 2.60): exploration off.
 
-    def __init__(self, pipelines: Pipelines, recipe: Recipe, network: Network) -> None:
-        self.pipelines = pipelines
+    It begins with new episodes and connectors that remember nothing.
+    """
+
+    def __init__(self, pipelines: Pipelines, recipe: Recipe, network: RLModuleNetwork) -> None:
+        self.pipelines = pipelines.fresh()
         self._recipe = recipe
         self._network = network
+        self._shared: dict[str, Any] = {}
         self._episodes: list[Any] = []
         self._last: list[tuple[Any, dict[str, Any]]] = []
 
     def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
-        """Return what RLlib computes for one step of every row, by output name."""
-        rows = _rows(self._recipe.observation_space, inputs, len(restart))
+        """Return what RLlib computes for one step of every row, by output name.
+
+        `inputs` may hold the last step's rewards as "reward", whether the policy sees them or not.
+        """
+        rows = _rows(self.pipelines, inputs, len(restart))
         rewards = inputs.get("reward", np.zeros(len(restart)))
         if not self._episodes:
             self._episodes = [None] * len(rows)
@@ -160,14 +177,14 @@ class NewStackLoop:
             else:
                 action, extra = self._last[row]
                 self.pipelines.advance(self._episodes[row], obs, action, float(rewards[row]), extra)
-        batch, shared = self.pipelines.to_module(self._episodes)
+        batch = self.pipelines.to_module(self._episodes, self._shared, **self._columns(rows, rewards))
         forward = self.pipelines.forward(batch)
         outputs = self._outputs(batch, forward)
         if is_nested(self._recipe.action_space):
             # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray
             # 2.60). No action depends on it.
             forward.setdefault(Columns.ACTION_LOGP, torch.zeros(len(rows)))
-        columns = self.pipelines.to_env(forward, self._episodes, shared)
+        columns = self.pipelines.to_env(forward, self._episodes, self._shared)
         # The episodes remember the module's own actions; the environment gets those that have been scaled.
         own = columns.pop(Columns.ACTIONS)
         action = columns.pop(Columns.ACTIONS_FOR_ENV, own)
@@ -176,6 +193,17 @@ class NewStackLoop:
         ]
         actions = {name: np.asarray(leaf) for name, leaf in named_leaves(action, "action").items()}
         return {**actions, **outputs}
+
+    def _columns(self, rows: list[Any], rewards: NDArray[Any]) -> dict[str, Any]:
+        """Return the last step as RLlib gives it to connectors beside the episodes: of a first step without actions."""
+        column = self.pipelines.column
+        columns = {Columns.OBS: column(rows), Columns.INFOS: column([NoInfo() for _ in rows])}
+        if self._last:
+            columns[Columns.ACTIONS] = column([action for action, _ in self._last])
+            columns[Columns.REWARDS] = column([float(reward) for reward in rewards])
+            for name in (Columns.TERMINATEDS, Columns.TRUNCATEDS):
+                columns[name] = column([False] * len(rows))
+        return columns
 
     def _outputs(self, batch: dict[str, Any], forward: dict[str, Any]) -> Outputs:
         """Return the network's outputs: those of the forward pass, copied, and those that take a pass of their own."""
@@ -200,10 +228,9 @@ def _pick(tree: Tree, row: int) -> Tree:
     return map_tree(lambda leaf: leaf[row], tree)
 
 
-def _rows(space: Any, inputs: Inputs, count: int) -> list[Any]:
+def _rows(pipelines: Pipelines, inputs: Inputs, count: int) -> list[Any]:
     """Return each observation in the form an environment gives it."""
-    names = list(space_leaves(space, "obs"))
-    return [build(space, [inputs[name][row] for name in names]) for row in range(count)]
+    return [pipelines.observation({name: values[row] for name, values in inputs.items()}) for row in range(count)]
 
 
 def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, value: bool = True) -> RestoredPolicy:
@@ -221,6 +248,8 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
         raise UnsupportedError(f"module {name} is not exported: {why}")
     no_value = _check_weights(files, module)
     module.eval().requires_grad_(False)
+    # The gate's own connectors, by RLlib's own way: an error of the recipe must not be in both.
+    own, how = _reference_pipelines(files, (env_to_module, module_to_env), module, notify)
     slot = find_agent_slot(files, module, env_to_module, module_to_env)
     observation_space = slot.part(env_to_module.input_observation_space)
     action_space: Any = slot.part(module_to_env.input_action_space) or module.action_space
@@ -241,15 +270,43 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     traced = _second_module(module, files)
     replace_heads(traced)
     rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
-    network = Network(traced, names, acts=mode == "given", rule=rule)
+    network = RLModuleNetwork(traced, names, acts=mode == "given", rule=rule)
     module_class = f"{type(module).__module__}.{name}"
-    if files.has_pipelines:
-        # The gate's own copies, read from RLlib's place: an error of the recipe must not be in both.
-        folder = connectors_that_rllib_restores(files)
-        env_to_module, module_to_env = _read_pipelines(files, folder, module, lambda _: None)
-        read_observation_steps(env_to_module, files, slot)  # freezes the filter
-        pipelines = pipelines_of(slot, module, env_to_module, module_to_env, observation_space, action_space)
-    return RestoredPolicy(recipe, network, module_class, partial(NewStackLoop, pipelines, recipe, network), slot.agents)
+    reference = pipelines_of(slot, module, *own, observation_space, action_space)
+    start_loop = partial(NewStackLoop, reference, recipe, network)
+    return RestoredPolicy(recipe, network, module_class, start_loop, slot.agents, reference=how)
+
+
+def _reference_pipelines(
+    files: CheckpointFiles, listed: tuple[Any, Any], module: Any, notify: Callable[[str], None]
+) -> tuple[tuple[Any, Any], str]:
+    """Return (pipelines of the parity gate's reference, what they are if not what RLlib itself would restore).
+
+    `listed` are those that the recipe is read from. Raises UnsupportedError if they are not the configuration's.
+    """
+    config = read_algorithm_config(files)
+    if not files.has_pipelines:
+        return listed, ALONE if config is None else ""
+    if config is None or is_older(files.env_to_module):
+        folder = files.runner if config is None else folder_of_connectors(files, config)
+        if files.has_own_connectors:
+            notify(
+                f"{files.root} holds connectors of your own and "
+                + ("no configuration of the algorithm" if config is None else "was saved by an older Ray")
+                + ": their arguments are those that RLlib recorded, often wrongly, and NOT proven; export the "
+                "checkpoint as a current Ray saved it, if you can"
+            )
+        again = _read_pipelines(files, folder, module, lambda _: None)
+        for pipeline in again:
+            freeze(pipeline)
+        return again, LISTED
+    folder = folder_of_connectors(files, config)
+    spaces = (listed[0].input_observation_space, listed[0].input_action_space)
+    build = partial(restore_pipelines, files, config, folder, spaces)
+    check_same(str(files.root), listed, built := build(), build)
+    for pipeline in built:
+        freeze(pipeline)
+    return built, ""
 
 
 def _read_pipelines(
@@ -428,10 +485,12 @@ def _unbound(kind: type) -> type:
 
 def _forward_once(pipelines: Pipelines, recipe: Recipe) -> dict[str, Any]:
     """Return the inference forward's output for two likely observations."""
-    episodes = [pipelines.begin(obs) for obs in _rows(recipe.observation_space, draw_pair(recipe), 2)]
+    episodes = [pipelines.begin(obs) for obs in _rows(pipelines, draw_pair(recipe), 2)]
     name = type(pipelines.module).__name__
     try:
-        forward = pipelines.forward(pipelines.to_module(episodes)[0])
+        forward = pipelines.forward(pipelines.to_module(episodes, {}))
+    except UnsupportedError:
+        raise
     except Exception as error:  # the user's own forward may raise anything
         raise UnsupportedError(
             f"module {name} does not run on what the pipeline gives it: {first_line(error)}"

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict
 
-from rlservo.export.contract.errors import UnsupportedError
+from rlservo.errors import UnsupportedError
 from rlservo.export.recipe.recipe import ObservationStep, Preprocess, Transform, leaf_transform
 from rlservo.export.recipe.trees import space_leaves
 from rlservo.export.rllib import private_names
-from rlservo.export.rllib.frozen_filter import frozen_filter
+from rlservo.export.rllib.mean_std_filter import frozen_filter
 
 # Agent connectors that change no number of a stateless policy's observation, and action connectors likewise.
 AGENT_PLUMBING = frozenset({"ClipRewardAgentConnector", "StateBufferConnector", "ViewRequirementAgentConnector"})
@@ -103,6 +103,11 @@ def _preprocessing(preprocessor: Any) -> list[ObservationStep]:
         raise UnsupportedError(
             f"the preprocessor {name} for observations {space} is not exported: it resizes images or "
             "pads lists, outside torch"
+        )
+    if isinstance(space, Dict) and list(space.spaces) != sorted(space.spaces):
+        raise UnsupportedError(
+            f"the parts of {space} are not in sorted order: RLlib's preprocessor sorts a dict and takes an OrderedDict "
+            "as it comes, and the checkpoint does not hold which of them the environment gives"
         )
     for inner in getattr(preprocessor, "preprocessors", ()):
         _preprocessing(inner)  # refuses unsupported ones, and switches off the checks

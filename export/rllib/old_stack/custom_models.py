@@ -19,8 +19,8 @@ from ray.rllib.models.torch.torch_action_dist import TorchDistributionWrapper
 from ray.rllib.models.torch.torch_modelv2 import TorchModelV2
 from ray.tune.registry import RLLIB_ACTION_DIST, RLLIB_MODEL
 
+from rlservo.errors import CheckpointError
 from rlservo.export.checkpoints.unpickle import explain, searched
-from rlservo.export.contract.errors import CheckpointError
 from rlservo.export.rllib import private_names
 
 REGISTER = "register_custom_model"

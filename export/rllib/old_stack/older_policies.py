@@ -10,10 +10,10 @@ import numpy as np
 from ray.rllib.algorithms.registry import POLICIES, get_policy_class_name
 from ray.rllib.utils.filter import RunningStat
 
+from rlservo.errors import UnsupportedError
 from rlservo.export.checkpoints.old_location import ALGORITHM_STATE, OldStackFiles
 from rlservo.export.checkpoints.older_rays import with_current_statistics
 from rlservo.export.checkpoints.unpickle import unpickle
-from rlservo.export.contract.errors import UnsupportedError
 
 MIXTURES = ("enable_rl_module_and_learner", "_enable_rl_module_api", "_enable_new_api_stack")
 """Settings that put an RLModule into an old-stack policy; up to Ray 2.8 that was PPO's default."""

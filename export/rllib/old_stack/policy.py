@@ -33,13 +33,13 @@ from ray.rllib.utils.torch_utils import convert_to_torch_tensor
 from ray.rllib.utils.typing import ActionConnectorDataType, AgentConnectorDataType
 from torch import Tensor, nn
 
+from rlservo.bundle.scores import ACTION_DIST_INPUTS, Q_VALUES
+from rlservo.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import explain, unpickle
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError, first_line
-from rlservo.export.contract.scores import ACTION_DIST_INPUTS, Q_VALUES
 from rlservo.export.recipe.recipe import DistributionKind, Mode, ObservationStep, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Inputs, Outputs
-from rlservo.export.recipe.trees import build, named_leaves, space_leaves, tree_leaves
+from rlservo.export.recipe.trees import build_in_order, named_leaves, space_leaves, tree_leaves
 from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
 from rlservo.export.rllib.old_stack.connectors import check_connectors, read_old_steps, read_old_transform
@@ -89,29 +89,40 @@ def _distribution(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Tensor, A
 
 
 class OldStackLoop:
-    """RLlib acting step after step, as `EnvRunnerV2` does it (ray 2.60): exploration off, filter frozen."""
+    """RLlib acting step after step, as `EnvRunnerV2` does it (ray 2.60): exploration off, filter frozen.
+
+    It begins with new episodes: what the policy's connectors have kept of others is forgotten.
+    """
 
     def __init__(self, policy: Any, recipe: Recipe, names: tuple[str, ...]) -> None:
         self.policy = policy
         self._recipe = recipe
         self._names = names
+        self._steps: dict[str, int] = {}
 
     def step(self, inputs: Inputs, restart: NDArray[np.bool_]) -> Outputs:
-        """Return what RLlib computes for one step of every row, each an environment of its own, by output name."""
+        """Return what RLlib computes for one step of every row, each an environment of its own, by output name.
+
+        `inputs` may hold the last step's rewards as "reward", whether the policy sees them or not.
+        """
         policy, envs = self.policy, [str(row) for row in range(len(restart))]
+        rewards = inputs.get("reward", np.zeros(len(restart)))
         items = []
         for row, env in enumerate(envs):
-            if restart[row]:
+            begins = restart[row] or env not in self._steps
+            if begins:
                 policy.agent_connectors.reset(env)
-            names = list(self._recipe.observation_leaves)
+            self._steps[env] = -1 if begins else self._steps[env] + 1  # RLlib counts the initial observation as -1
+            leaves = {name: values[row] for name, values in inputs.items()}
             columns = {
-                SampleBatch.NEXT_OBS: build(self._recipe.observation_space, [inputs[name][row] for name in names]),
+                SampleBatch.NEXT_OBS: build_in_order(self._recipe.observation_space, leaves),
                 SampleBatch.INFOS: {},
-                SampleBatch.T: 0,
+                SampleBatch.T: self._steps[env],
                 SampleBatch.AGENT_INDEX: 0,
             }
-            if not restart[row]:
-                columns |= {SampleBatch.REWARDS: 0.0, SampleBatch.TERMINATEDS: False, SampleBatch.TRUNCATEDS: False}
+            if not begins:
+                columns |= {SampleBatch.REWARDS: float(rewards[row])}
+                columns |= {SampleBatch.TERMINATEDS: False, SampleBatch.TRUNCATEDS: False}
             items.append(AgentConnectorDataType(env, AGENT, columns))
         processed = policy.agent_connectors(items)
         batch: Any = concat_samples([item.data.sample_batch for item in processed])

@@ -22,7 +22,8 @@ import orjson
 from google.protobuf import json_format
 from google.protobuf.message import DecodeError
 
-from rlservo.export.contract.errors import (
+from rlservo.client.formats.addresses import is_loopback
+from rlservo.errors import (
     DeadlineError,
     ForbiddenError,
     RequestError,
@@ -32,18 +33,17 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UnknownPolicyError,
 )
-from rlservo.serve_app.episodes.request import Request
 from rlservo.serve_app.protocols.error_statuses import describe
 from rlservo.serve_app.protocols.open_inference import model_info
 from rlservo.serve_app.protocols.open_inference.infer import ReplyOptions, fill, reply_of
-from rlservo.serve_app.protocols.open_inference.messages import messages
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.protocols.open_inference.tensors import DTYPES, datatype_of
 from rlservo.serve_app.server.access_checks import LABEL, StreamKey, authorize, header_text, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.versions.policy_store import Decision
-from rlservo.serve_app.wire.addresses import is_loopback
+from rlservo.serve_app.sessions.request import Request
+from rlservo.serve_app.versions.loaded_versions import Decision
 
 PROTOCOL = "grpc"
 REQUEST_ID = "x-request-id"
@@ -166,10 +166,8 @@ class OipGrpcCodec:
         store = handler.store()
         store.get(request.policy, request.version)
         if len(content) > SMALL:
-            check_length(store, request.policy, content, handler.settings.max_batch)
-        for field in ("inputs", "outputs", "parameters", "raw_input_contents"):
-            if len(getattr(message, field)) > SPARE:
-                raise TooLargeError(f"the message has more than {SPARE} {field}")
+            bounds = check_length(store, request.policy, content, handler.settings.max_batch)
+            _check_counts(message, max(each.values for each in bounds))
         document, raw = _document_of(message)
         fill(handler, request, document, memoryview(b"".join(raw)))
         # A reply is bytes altogether or typed fields altogether, and not every type has a field.
@@ -193,6 +191,24 @@ class OipGrpcCodec:
 
 
 CODEC = OipGrpcCodec()
+
+
+def _check_counts(message: Any, most_numbers: int) -> None:
+    """Raise TooLargeError for more of anything repeated than a request can need."""
+    tensors = [*message.inputs[: SPARE + 1], *message.outputs[: SPARE + 1]]
+    contents = [field for tensor in message.inputs[: SPARE + 1] for _, field in tensor.contents.ListFields()]
+    counts = {
+        "inputs": len(message.inputs),
+        "outputs": len(message.outputs),
+        "parameters": sum(len(each.parameters) for each in (message, *tensors)),
+        "sizes": sum(len(each.shape) for each in message.inputs[: SPARE + 1]),
+        "raw_input_contents": len(message.raw_input_contents),
+    }
+    for what, count in counts.items():
+        if count > SPARE:
+            raise TooLargeError(f"the message has more than {SPARE} {what}")
+    if sum(map(len, contents)) > most_numbers:
+        raise TooLargeError(f"the message has more than {most_numbers} numbers")
 
 
 def _document_of(message: Any) -> tuple[dict[str, Any], Sequence[bytes]]:

@@ -24,10 +24,11 @@ from pydantic import ConfigDict, Field, SkipValidation, TypeAdapter, with_config
 from starlette.types import Receive
 from typing_extensions import Required, TypedDict
 
-from rlservo.export.contract.contract import REWARD
-from rlservo.export.contract.errors import ObservationError, RequestError, quoted
-from rlservo.export.contract.nested import action_leaves, build_action
-from rlservo.serve_app.episodes.request import LONGEST_SESSION_ID, Request, reply_fields
+from rlservo.bundle.contract import REWARD
+from rlservo.bundle.nested import action_leaves, build_action
+from rlservo.client.formats.request_names import BELONGS_TO
+from rlservo.errors import ObservationError, RequestError, quoted
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers, too_large
 from rlservo.serve_app.protocols.http_endpoint import (
     OCTETS,
@@ -40,11 +41,10 @@ from rlservo.serve_app.protocols.http_endpoint import (
 from rlservo.serve_app.protocols.open_inference.tensors import DTYPES, read_inputs, write_tensor
 from rlservo.serve_app.protocols.request_fields import Options, fill_request, parse_fields, parse_json, strict
 from rlservo.serve_app.protocols.routes import POST, Route, of_policy
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.versions.policy_store import Decision
-from rlservo.serve_app.wire.request_names import BELONGS_TO
+from rlservo.serve_app.sessions.request import LONGEST_SESSION_ID, Request, reply_fields
+from rlservo.serve_app.versions.loaded_versions import Decision
 
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
 STATE_IN, STATE_OUT = "state_in.", "state_out."

@@ -19,9 +19,9 @@ from pydantic import TypeAdapter
 from typing_extensions import TypedDict
 
 import rlservo
-from rlservo.export.contract.bundle import ONNX_FILE
-from rlservo.export.contract.contract import TensorSpec
-from rlservo.export.contract.errors import RequestError
+from rlservo.bundle.bundle import ONNX_FILE
+from rlservo.bundle.contract import TensorSpec
+from rlservo.errors import RequestError
 from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers, too_large
 from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
 from rlservo.serve_app.protocols.open_inference.infer import STATE_IN, STATE_OUT, is_optional, model_of

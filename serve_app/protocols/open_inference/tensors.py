@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.export.contract.errors import ObservationError, RequestError
+from rlservo.errors import ObservationError, RequestError
+from rlservo.policy.input_numbers import parse_array
 from rlservo.serve_app.protocols.request_fields import json_type
-from rlservo.serve_app.runtime.input_numbers import parse_array
 
 DATATYPES = "BOOL UINT8 UINT16 UINT32 UINT64 INT8 INT16 INT32 INT64 FP16 FP32 FP64"  # in the order of Triton's DataType
 DTYPES: dict[str, np.dtype[Any]] = {

@@ -1,6 +1,6 @@
 // A policy's contract as tables: what it observes, element by element, what it does, and where it came from.
 
-import { clip, element, setText, showFacts, table } from "./dom.js";
+import { clip, element, labelCells, number, setText, showFacts, stamp, table } from "./dom.js";
 
 const MOST_ELEMENTS = 128; // of a leaf; an image's pixels are no rows each, nor series of the metrics
 const MOST_ROWS = 512; // of a table
@@ -8,7 +8,6 @@ const FILTER = "mean_std_filter";
 const FAR = 1; // [standard deviations of the training] of a shift worth a look, as in the Grafana dashboard
 const BOUNDED = ["#", "Element", "Unit", "Low", "High"];
 const COMPARED = ["Mean in training", "Spread in training", "Shift now [σ]", "Spread now"];
-const RUNS = ["Environment", "Episodes", "Return, bundle", "… checkpoint", "Success, bundle", "… checkpoint"];
 
 /** Return the contract as a node, and a function that shows a drift (`driftOf`) in it. */
 export function showContract(contract) {
@@ -19,18 +18,9 @@ export function showContract(contract) {
   showFacts(facts, factsOf(contract));
   node.append(facts);
   node.append(observations(contract, rows), actions(contract));
-  if (contract.state.length > 0) node.append(memory(contract.state));
-  node.append(tensors(contract));
   node.append(element("h4", { text: "Baked into the graph, in this order" }), steps(contract.baked_in));
-  if (contract.evaluations.length > 0) node.append(evaluations(contract.evaluations));
+  labelCells(node);
   return { node, showDrift: (drift) => showDrift(rows, drift) };
-}
-
-/** Return a number as people write it. */
-export function number(value, digits = 4) {
-  if (value === null || value === undefined || Number.isNaN(value)) return "–";
-  if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
-  return Number(value.toPrecision(digits)).toString().replace("-", "−");
 }
 
 /** Return whether an element's observations are far from those of the training. */
@@ -45,18 +35,31 @@ function factsOf(contract) {
     provenance.training_iterations && `${provenance.training_iterations} iterations`,
     provenance.env_steps && `${provenance.env_steps} steps`,
   ];
+  const framework = provenance.api_stack
+    ? `RLlib's ${provenance.api_stack} API stack, Ray ${provenance.ray_version}`
+    : provenance.framework;
   const proven = Object.entries(parity.formats).map(
     ([format, { max_abs: most }]) => `${format}: largest difference ${number(most, 2)}`,
   );
   return [
     ["Description", clip(contract.description)],
-    ["Algorithm", `${provenance.algorithm} (RLlib's ${provenance.api_stack} API stack, Ray ${provenance.ray_version})`],
+    ["Algorithm", `${provenance.algorithm} (${framework})`],
     ["Trained", trained.filter(Boolean).join(", ")],
-    ["Exported", provenance.exported_at],
+    ["Exported", stamp(provenance.exported_at)],
     ["Control rate", contract.control_rate_hz && `${number(contract.control_rate_hz)} Hz`],
+    ["Memory", contract.state.map(({ name, shape }) => `${name} (${shape.join(", ")})`).join(", ")],
     ["Exploring", distribution ? distribution.kind.replaceAll("_", " ") : "not possible"],
+    ["In closed loop", contract.evaluations.map(sayRun).join("; ")],
     ["Proven", `${parity.samples} observations against ${parity.reference}; ${proven.join("; ")}`],
   ];
+}
+
+function sayRun(run) {
+  const say = (kind) => {
+    const [reward, share] = [run[`return_${kind}`], run[`success_rate_${kind}`]];
+    return `return ${number(reward)}${share === null ? "" : `, success ${number(100 * share)}%`}`;
+  };
+  return `${run.episodes} episodes of ${run.env_id}: ${say("bundle")} (the checkpoint: ${say("checkpoint")})`;
 }
 
 function observations(contract, rows) {
@@ -126,12 +129,8 @@ function* elements(space, path) {
 
 /** Return the lowest and the highest bound of a large leaf. */
 function extent(space, size) {
-  let [low, high] = [Infinity, -Infinity];
-  const listed = [space.low, space.high, space.nvec].some(Array.isArray);
-  for (let index = 0; index < (listed ? size : 1); index++) {
-    const [lower, upper] = bounds(space, index);
-    [low, high] = [Math.min(low, lower), Math.max(high, upper)];
-  }
+  const sides = [0, 1].map((side) => Array.from({ length: size }, (_, index) => bounds(space, index)[side]));
+  const [low, high] = [Math.min, Math.max].map((most, side) => sides[side].reduce((a, b) => most(a, b)));
   return { low, high };
 }
 
@@ -157,22 +156,6 @@ function filterOf(contract) {
   return mean.length > MOST_ELEMENTS ? null : { mean, std };
 }
 
-function memory(states) {
-  const { region, body } = table("Memory, carried from step to step", ["Name", "Kind", "Type", "Shape"]);
-  for (const { name, kind, dtype, shape } of states) {
-    body.append(cells(name, "", [kind.replaceAll("_", " "), dtype, `(${shape.join(", ")})`]));
-  }
-  return region;
-}
-
-function tensors({ inputs, outputs }) {
-  const { region, body } = table("Tensors of the graph, the batch first", ["Name", "Side", "Type", "Shape"]);
-  for (const [side, those] of Object.entries({ input: inputs, output: outputs })) {
-    for (const { name, dtype, shape } of those) body.append(cells(name, "", [side, dtype, `(${shape.join(", ")})`]));
-  }
-  return region;
-}
-
 function steps(baked) {
   return element(
     "ol",
@@ -181,22 +164,6 @@ function steps(baked) {
       element("li", { class: "given", text: step.replaceAll("_", " ") + (detail && `: ${clip(detail, 500)}`) }),
     ),
   );
-}
-
-function evaluations(runs) {
-  const { region, body } = table("Closed-loop runs, on the same seeds", RUNS);
-  const percent = (share) => (share === null ? "–" : `${number(100 * share)}%`);
-  for (const run of runs) {
-    const returns = [run.return_bundle, run.return_checkpoint].map((value) => number(value));
-    const successes = [run.success_rate_bundle, run.success_rate_checkpoint].map(percent);
-    body.append(cells(run.env_id, "number", [String(run.episodes), ...returns, ...successes]));
-  }
-  return region;
-}
-
-function cells(name, kind, texts) {
-  const heading = element("th", { scope: "row", class: "given", text: clip(name, 200) });
-  return element("tr", {}, heading, ...texts.map((text) => element("td", { class: kind, text })));
 }
 
 function showDrift(rows, drift) {

@@ -51,11 +51,20 @@ export function keep(parent, items, keyOf, make, update = () => {}) {
 /** Return a table within a region that scrolls by itself, by keyboard as well; `columns` are its headings. */
 export function table(caption, columns) {
   const body = element("tbody");
-  const title = element("caption", {}, element("span", { text: caption }));
+  const title = element("caption", { text: caption });
   const head = element("tr", {}, ...columns.map((column) => element("th", { scope: "col", text: column })));
   const whole = element("table", {}, title, element("thead", {}, head), body);
   const region = element("div", { class: "scroll", role: "region", tabindex: "0", "aria-label": caption }, whole);
   return { region, body };
+}
+
+/** Give cells of the tables in a node their columns' names, which a small screen shows beside them. */
+export function labelCells(node) {
+  for (const { tHead, tBodies } of node.querySelectorAll("table")) {
+    for (const { cells } of tBodies[0].rows) {
+      [...cells].forEach((cell, index) => cell.setAttribute("data-label", tHead.rows[0].cells[index].textContent));
+    }
+  }
 }
 
 /** Show facts as a list of terms; those without a text are left out. */
@@ -72,4 +81,17 @@ export function showFacts(list, facts) {
 /** Return text no longer than a page can show. */
 export function clip(text, longest = 2000) {
   return text.length > longest ? `${text.slice(0, longest)} …` : text;
+}
+
+/** Return a number as people write it. */
+export function number(value, digits = 4) {
+  if (value === null || value === undefined || Number.isNaN(value)) return "–";
+  if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
+  return Number(value.toPrecision(digits)).toString().replace("-", "−");
+}
+
+/** Return a time since 1970 [s], or one in words, as local time. */
+export function stamp(time) {
+  const date = new Date(typeof time === "number" ? 1000 * time : time);
+  return Number.isNaN(date.getTime()) ? String(time) : date.toLocaleString("sv"); // 2026-07-31 14:05:09
 }

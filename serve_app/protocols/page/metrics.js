@@ -11,10 +11,14 @@ export function parse(text) {
   for (const line of text.split("\n")) {
     const [, name, labels = "", value] = SAMPLE.exec(line) ?? [];
     if (name === undefined) continue; // a comment, or nothing
-    if (!samples.has(name)) samples.set(name, []);
-    samples.get(name).push({ labels: labelsOf(labels), value: numberOf(value) });
+    push(samples, name, { labels: labelsOf(labels), value: numberOf(value) });
   }
   return samples;
+}
+
+function push(lists, key, item) {
+  lists.set(key, lists.get(key) ?? []);
+  lists.get(key).push(item);
 }
 
 function labelsOf(text) {
@@ -39,12 +43,7 @@ export function sum(samples, name, wanted) {
 
 /** Return such samples summed by one label. */
 export function sumBy(samples, name, label, wanted) {
-  const sums = new Map();
-  for (const { labels, value } of select(samples, name, wanted)) {
-    const key = labels.get(label) ?? "";
-    sums.set(key, (sums.get(key) ?? 0) + value);
-  }
-  return sums;
+  return merge(select(samples, name, wanted).map(({ labels, value }) => [[labels.get(label) ?? "", value]]));
 }
 
 /** Return the samples of each replica in a text's. */
@@ -54,9 +53,7 @@ function byReplica(samples) {
     for (const sample of all) {
       const replica = sample.labels.get("replica") ?? "";
       if (!replicas.has(replica)) replicas.set(replica, new Map());
-      const own = replicas.get(replica);
-      if (!own.has(name)) own.set(name, []);
-      own.get(name).push(sample);
+      push(replicas.get(replica), name, sample);
     }
   }
   return replicas;
@@ -127,6 +124,12 @@ export class Looks {
     return rate;
   }
 
+  /** Return how many requests were answered and how many failed, by `rate` or `total`. */
+  requests(by, wanted = {}) {
+    const [all, answered] = [wanted, { ...wanted, code: "ok" }].map((each) => this[by]("rlservo_requests_total", each));
+    return [answered, all === null ? null : Math.max(all - answered, 0)];
+  }
+
   /** Return a histogram's quantiles: of the window (`recent`) or, where nothing was counted in it, since the start. */
   quantiles(name, wanted, shares) {
     const bucket = `${name}_bucket`;
@@ -170,19 +173,14 @@ export function quantile(counts, share) {
   return Infinity;
 }
 
-/** Return a version's drift by element, {shift, spread}, of the replica that has moved furthest; null without any. */
+/** Return drift by element, {shift, spread}, the furthest first, of the replica that moved furthest; null without. */
 export function driftOf(newest, wanted) {
+  const further = ([, a], [, b]) => Math.abs(b.shift) - Math.abs(a.shift);
   const found = newest.map((samples) => {
-    const elements = new Map();
-    for (const { labels, value } of select(samples, "rlservo_observation_shift", wanted)) {
-      elements.set(labels.get("element"), { shift: value, spread: NaN });
-    }
-    for (const { labels, value } of select(samples, "rlservo_observation_spread", wanted)) {
-      const element = elements.get(labels.get("element"));
-      if (element !== undefined) element.spread = value;
-    }
-    return elements;
+    const spreads = sumBy(samples, "rlservo_observation_spread", "element", wanted);
+    const shifts = sumBy(samples, "rlservo_observation_shift", "element", wanted);
+    return [...shifts].map(([name, shift]) => [name, { shift, spread: spreads.get(name) ?? NaN }]).sort(further);
   });
-  const moved = (elements) => Math.max(...[...elements.values()].map(({ shift }) => Math.abs(shift)));
-  return found.filter(({ size }) => size > 0).sort((a, b) => moved(b) - moved(a))[0] ?? null;
+  const [furthest] = found.filter(({ length }) => length > 0).sort(([a], [b]) => further(a, b));
+  return furthest ? new Map(furthest) : null;
 }

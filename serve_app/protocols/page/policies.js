@@ -1,25 +1,19 @@
-// The policies on the page: a section for each, with its versions, a curve of its requests and an open contract.
+// The policies on the page: a section for each, with its charts, its versions and an open contract.
 
-import { isFar, number, showContract } from "./contract.js";
-import { clip, drawing, element, keep, setText, showFacts, table } from "./dom.js";
+import { bar, chart, timeTicks } from "./chart.js";
+import { isFar, showContract } from "./contract.js";
+import { clip, element, keep, labelCells, number, setText, showFacts, table } from "./dom.js";
 import { driftOf } from "./metrics.js";
 
 const PRODUCTION = "production";
-const COLUMNS = [
-  "Version",
-  "State",
-  "Aliases",
-  "Requests",
-  "Per second",
-  "Failures",
-  "Latency p50 / p99",
-  "Drift",
-  "Contract",
-];
-const NUMBERS = new Set(["Requests", "Per second", "Latency p50 / p99"]);
-const CURVE_S = 120;
-const WIDTH = 240;
-const HEIGHT = 36;
+const COLUMNS = ["Version", "State", "Aliases", "Requests", "Per second", "Share"];
+COLUMNS.push("Failures", "Latency p50 / p99", "Drift", "Contract");
+const NUMBERS = new Set(["Requests", "Per second", "Share", "Latency p50 / p99"]);
+const KEPT_S = 900; // of the curves
+const SHORTEST_S = 60;
+const QUIET = "No requests yet: their rate, their latency and the drift of observations appear with the first.";
+const MOST_DRIFTS = 6;
+const DRIFT_SCALE = 3; // [standard deviations]
 
 const sections = new WeakMap(); // section -> what is in it
 
@@ -39,32 +33,38 @@ export function showPolicies(main, listing, { looks, askContract, at }) {
 
 function makeSection({ name }, askContract) {
   const id = `policy-${name}`;
-  const versions = table(`Versions of ${name}`, COLUMNS);
   const parts = {
-    description: element("p", { class: "given" }),
-    facts: element("dl"),
-    versions,
-    line: drawing("polyline"),
-    curve: null,
-    curveText: element("p", { class: "note" }),
-    rates: [],
-    success: { line: drawing("polyline"), curve: null, text: element("p", { class: "note" }) },
+    description: element("p", { class: "given note" }),
+    facts: element("dl", { class: "facts" }),
+    requests: chart("Requests [1/s]", ["answered", "failed"], "The curves begin with the next look.", 1),
+    latency: chart("Latency [ms]", ["p50", "p99"], "p50 and p99 over time appear with the next request."),
+    success: chart("Success by version [%]", ["newest"], "", 100),
+    successText: element("p", { class: "note" }),
+    drift: element("ul"),
+    driftText: element("p", { class: "note" }),
+    quiet: element("p", { class: "note", text: QUIET }),
+    charts: element("div", { class: "charts" }),
+    looks: [], // [time, answered a second, failed a second, p50, p99]
+    versions: table(`Versions of ${name}`, COLUMNS),
     contract: element("div", { id: `${id}-contract` }),
     shown: null, // {version, showDrift} of the open contract
     askContract,
   };
-  const size = { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none" };
-  parts.curve = drawing("svg", { class: "curve", role: "img", ...size }, parts.line);
-  parts.success.curve = drawing("svg", { class: "curve", role: "img", ...size }, parts.success.line);
+  parts.success.figure.append(parts.successText);
+  const title = element("figcaption", {}, element("strong", { text: "Drift by element [σ of the training]" }));
+  parts.charts.append(
+    ...[parts.requests, parts.latency, parts.success].map(({ figure }) => figure),
+    element("figure", { class: "drift" }, title, parts.drift, parts.driftText),
+  );
   const section = element(
     "section",
     { class: "policy", "aria-labelledby": id },
     element("h2", { id, text: name }),
     parts.description,
     parts.facts,
-    element("div", { class: "rates" }, parts.curve, parts.curveText),
-    element("div", { class: "rates" }, parts.success.curve, parts.success.text),
-    versions.region,
+    parts.quiet,
+    parts.charts,
+    parts.versions.region,
     parts.contract,
   );
   sections.set(section, parts);
@@ -73,10 +73,12 @@ function makeSection({ name }, askContract) {
 
 function updateSection(parts, policy, looks, at) {
   setText(parts.description, clip(policy.description));
-  parts.description.hidden = policy.description === "";
   showFacts(parts.facts, factsOf(policy, looks));
-  drawCurve(parts, looks.rate("rlservo_requests_total", { policy: policy.name, code: "ok" }), at);
-  drawSuccess(parts.success, successes(policy.name, looks));
+  parts.quiet.hidden = looks.total("rlservo_requests_total", { policy: policy.name }) > 0;
+  parts.charts.hidden = !parts.quiet.hidden;
+  drawLooks(parts, policy.name, looks, at);
+  drawSuccess(parts, successes(policy.name, looks));
+  showDrifts(parts, { policy: policy.name, version: policy.version }, looks);
   keep(
     parts.versions.body,
     policy.version_states,
@@ -84,6 +86,7 @@ function updateSection(parts, policy, looks, at) {
     ({ version }) => makeRow(parts, policy.name, version),
     (row, status) => updateRow(row, policy, status, looks),
   );
+  labelCells(parts.versions.region);
   if (!policy.version_states.some(({ version }) => version === parts.shown?.version)) closeContract(parts);
   parts.shown?.showDrift?.(driftOf(looks.newest, { policy: policy.name, version: parts.shown.version }));
 }
@@ -100,8 +103,13 @@ function factsOf(policy, looks) {
     ["Shadow", shadow && `version ${shadow.version} computes along; ${compared(policy, looks)}`],
     ["Control rate", policy.control_rate_hz && `${number(policy.control_rate_hz)} Hz`],
     ["WebSockets", count("rlservo_streams") ? `${count("rlservo_streams")} open` : ""],
-    ["Sessions", count("rlservo_sessions") ? `${count("rlservo_sessions")} kept` : ""],
+    ["Sessions", saySessions(count)],
   ];
+}
+
+function saySessions(count) {
+  const [kept, begun, lost] = ["", "_begun_total", "_lost_total"].map((kind) => count(`rlservo_sessions${kind}`));
+  return begun + lost > 0 ? `${kept} kept, ${begun} begun, ${lost} requests for unknown ones` : "";
 }
 
 /** Return a canary in words. */
@@ -113,7 +121,7 @@ function compared({ name, shadow }, looks) {
   const wanted = { policy: name, shadow: shadow.version };
   const count = looks.total("rlservo_shadow_difference_count", wanted);
   const missed = looks.total("rlservo_shadow_missed_total", wanted);
-  if (count === 0) return `nothing is compared yet${missed ? `, ${missed} actions were missed` : ""}`;
+  if (count === 0) return `nothing is compared yet, ${missed} missed`;
   const mean = looks.total("rlservo_shadow_difference_sum", wanted) / count;
   return `${count} actions compared, mean difference ${number(mean, 3)}, ${missed} missed`;
 }
@@ -134,26 +142,28 @@ function makeRow(parts, name, version) {
 
 function updateRow(row, policy, status, looks) {
   const wanted = { policy: policy.name, version: status.version };
-  const answered = { ...wanted, code: "ok" };
   const codes = looks.totalBy("rlservo_requests_total", "code", wanted);
   codes.delete("ok");
   const failures = [...codes].filter(([, count]) => count > 0);
   const latency = looks.quantiles("rlservo_request_seconds", wanted, [0.5, 0.99]);
   const drift = driftOf(looks.newest, wanted);
+  const [[total], [rate]] = ["total", "rate"].map((by) => looks.requests(by, wanted));
+  const [all] = looks.requests("rate", { policy: policy.name });
   const texts = [
     sayStates(status),
     status.aliases.join(", "),
-    count(looks.total("rlservo_requests_total", answered)),
-    number(looks.rate("rlservo_requests_total", answered), 3),
-    failures.map(([code, times]) => `${code} ${count(times)}`).join(", ") || "0",
+    count(total),
+    number(rate, 3),
+    all ? `${number((100 * rate) / all, 2)}%` : "–",
+    failures.map(([code, times]) => `${code}\u00a0${count(times)}`).join(", ") || "0",
     sayLatency(latency),
     sayDrift(drift, looks, wanted),
   ];
   texts.forEach((text, index) => setText(row.children[index + 1], text));
   row.classList.toggle("in-use", status.version === policy.version);
   row.classList.toggle("failed", status.state === "failed");
-  row.children[5].classList.toggle("far", failures.length > 0);
-  row.children[7].classList.toggle("far", drift !== null && [...drift.values()].some(isFar));
+  row.children[6].classList.toggle("far", failures.length > 0);
+  row.children[8].classList.toggle("far", drift !== null && [...drift.values()].some(isFar));
 }
 
 function sayStates({ states, reason }) {
@@ -162,7 +172,8 @@ function sayStates({ states, reason }) {
   return every + (reason && `: ${clip(reason, 500)}`);
 }
 
-function sayLatency({ quantiles: [median, high], recent }) {
+/** Return a median and a high quantile in words. */
+export function sayLatency({ quantiles: [median, high], recent }) {
   if (median === null) return "–";
   const ms = (seconds) => (Number.isFinite(seconds) ? number(1e3 * seconds, 2) : "over 1000");
   return `${ms(median)} / ${ms(high)} ms${recent ? "" : ", earlier"}`;
@@ -173,7 +184,7 @@ function sayDrift(drift, looks, wanted) {
     const measured = looks.has("rlservo_observation_looks_total", wanted);
     return measured ? "nothing seen yet" : "no filter to compare with";
   }
-  const [name, { shift }] = [...drift].reduce((a, b) => (Math.abs(b[1].shift) > Math.abs(a[1].shift) ? b : a));
+  const [[name, { shift }]] = drift;
   const far = [...drift.values()].filter(isFar).length;
   return `${far > 0 ? `${far} of ${drift.size} far; ` : ""}most ${number(shift, 2)} σ: ${clip(name, 60)}`;
 }
@@ -182,45 +193,54 @@ function count(value) {
   return Math.round(value).toLocaleString("en");
 }
 
-function drawCurve(parts, rate, at) {
-  if (rate !== null) parts.rates.push([at, rate]);
-  parts.rates = parts.rates.filter(([time]) => time >= at - CURVE_S);
-  const begin = parts.rates[0]?.[0] ?? at;
-  const most = Math.max(1, ...parts.rates.map(([, value]) => value));
-  const x = (time) => (WIDTH * (time - begin)) / (at - begin || 1);
-  const y = (value) => HEIGHT - 1 - ((HEIGHT - 2) * value) / most;
-  parts.line.setAttribute("points", parts.rates.map(([t, v]) => `${x(t).toFixed(1)},${y(v).toFixed(1)}`).join(" "));
-  const highest = Math.max(0, ...parts.rates.map(([, value]) => value));
-  const text =
-    rate === null
-      ? "Requests a second: from the next look on"
-      : `${number(rate, 3)} requests a second; at most ${number(highest, 3)} in the last two minutes`;
-  setText(parts.curveText, text);
-  parts.curve.setAttribute("aria-label", `Curve: ${text}`);
+function drawLooks(parts, policy, looks, at) {
+  const { recent, quantiles } = looks.quantiles("rlservo_request_seconds", { policy }, [0.5, 0.99]);
+  const times = quantiles.map((seconds) => (recent ? 1000 * Math.min(seconds, 1) : null)); // the last bound is 1 s
+  parts.looks.push([at, ...looks.requests("rate", { policy }), ...times]);
+  parts.looks = parts.looks.filter(([time]) => time >= at - KEPT_S);
+  const from = Math.min(parts.looks[0][0], at - SHORTEST_S);
+  const rows = (...columns) => parts.looks.map((row) => columns.map((column) => row[column]));
+  parts.requests.draw(rows(0, 1, 2), from, at, timeTicks(from, at));
+  parts.latency.draw(rows(0, 3, 4), from, at, timeTicks(from, at));
+}
+
+function showDrifts({ drift, driftText }, wanted, looks) {
+  const all = [...(driftOf(looks.newest, wanted) ?? [])];
+  drift.parentElement.hidden = !looks.has("rlservo_observation_looks_total", wanted); // no filter to compare with
+  keep(
+    drift,
+    all.slice(0, MOST_DRIFTS),
+    ([name]) => name,
+    ([name]) => element("li", {}, element("span", { text: clip(name, 60) }), bar(0, 1), element("strong")),
+    (item, [, now]) => {
+      item.classList.toggle("far", isFar(now));
+      item.children[1].replaceWith(bar(now.shift, DRIFT_SCALE));
+      setText(item.lastChild, number(now.shift, 2));
+    },
+  );
+  const far = all.filter(([, now]) => isFar(now)).length;
+  const some = `Version ${wanted.version}: ${far} of ${all.length} are far; its contract shows all.`;
+  setText(driftText, all.length > 0 ? some : "What drifts most appears after some requests.");
 }
 
 /** Return [version, episodes that ended, share of success], the oldest version first, also of those unloaded since. */
 function successes(policy, looks) {
   const ends = "rlservo_episode_ends_total";
   const good = looks.totalBy(ends, "version", { policy, outcome: "success" });
-  const by = (version) => version.split(".").map(Number);
-  const order = ([a], [b]) => by(a).map((part, at) => part - (by(b)[at] ?? 0)).find(Boolean) ?? 0;
   return [...looks.totalBy(ends, "version", { policy })]
     .filter(([, count]) => count > 0)
-    .sort(order)
+    .sort(([a], [b]) => a.localeCompare(b, "en", { numeric: true }))
     .map(([version, count]) => [version, count, (good.get(version) ?? 0) / count]);
 }
 
-function drawSuccess({ line, curve, text }, all) {
-  curve.parentElement.hidden = all.length === 0;
+function drawSuccess({ success, successText }, all) {
+  success.figure.hidden = all.length === 0;
   if (all.length === 0) return;
-  const x = (at) => (all.length > 1 ? (WIDTH * at) / (all.length - 1) : 0);
-  const y = (share) => HEIGHT - 1 - (HEIGHT - 2) * share;
-  line.setAttribute("points", all.map(([, , share], at) => `${x(at).toFixed(1)},${y(share).toFixed(1)}`).join(" "));
+  const rows = all.map(([, , share], at) => [at, 100 * share]);
+  success.draw(rows, -0.5, all.length - 0.5, all.map(([version], at) => [at, version]));
   const say = ([version, episodes, share]) => `${number(100 * share, 3)}% of ${count(episodes)} with ${version}`;
   const ends = all.length > 1 ? [all[0], all.at(-1)] : all;
-  setText(text, `Episodes that succeeded, by version: ${ends.map(say).join(", … ")}`);
-  curve.setAttribute("aria-label", `Curve: ${text.textContent}`);
+  setText(successText, `Episodes that succeeded, by version: ${ends.map(say).join(", … ")}`);
 }
 
 async function toggleContract(parts, name, version) {

@@ -3,9 +3,9 @@
 // Each answer of `/v1/policies` and `/metrics` is one replica's, so the page keeps what each replica said last.
 
 import { changesBetween } from "./changes.js";
-import { clip, element, keep, setText, showFacts } from "./dom.js";
+import { clip, element, keep, number, setText, showFacts, stamp } from "./dom.js";
 import { driftOf, Looks, parse } from "./metrics.js";
-import { showPolicies } from "./policies.js";
+import { sayLatency, showPolicies } from "./policies.js";
 import { ask, hasKey, NoSuccess, useKey } from "./requests.js";
 
 const EVERY_MS = 2000;
@@ -25,6 +25,7 @@ let wantsKey = false;
 let delayMs = EVERY_MS;
 let awaySince = null;
 let shown = null; // the listing on the page
+let opened = 0; // the plan that was followed when the page began to note changes
 const listings = new Map(); // replica -> {at, listing}
 const looks = new Looks(WINDOW_S, KEPT_S);
 
@@ -78,13 +79,13 @@ function fail(error) {
     throw error;
   }
   if (awaySince === null) {
-    awaySince = new Date();
+    awaySince = Date.now() / 1000;
     note("the server does not answer");
   } else {
     delayMs = Math.min(2 * delayMs, SLOWEST_MS);
   }
   const why = error.message && ` (${error.message})`;
-  setText(byId("state"), `No answer since ${clock(awaySince)}${why}. This page goes on asking.`);
+  setText(byId("state"), `No answer since ${stamp(awaySince)}${why}. This page goes on asking.`);
   document.title = "rlservo: no answer";
   document.body.className = "away";
 }
@@ -115,9 +116,9 @@ function clear() {
   forget();
   awaySince = null;
   delayMs = EVERY_MS;
-  for (const id of ["policies", "warnings", "changes", "server-facts"]) keep(byId(id), [], () => null, () => null);
+  for (const id of ["policies", "warnings", "now", "past", "server-facts"]) keep(byId(id), []);
   byId("changes").replaceChildren();
-  for (const id of ["server", "history", "key-used"]) byId(id).hidden = true;
+  for (const id of ["history", "key-used"]) byId(id).hidden = true;
   document.body.className = "";
 }
 
@@ -162,20 +163,23 @@ function show(listing, at) {
   document.body.className = "";
   byId("key-form").hidden = true;
   byId("key-used").hidden = !hasKey();
-  for (const sentence of changesBetween(shown, listing)) note(sentence);
+  for (const sentence of changesBetween(shown, listing)) note(`${sentence}; ${sayPlan(listing)}`);
+  if (shown === null) opened = listing.generation;
   shown = listing;
   showPolicies(byId("policies"), listing, { looks, askContract, at });
-  const warnings = warningsOf(listing);
   keep(
     byId("warnings"),
-    warnings,
+    warningsOf(listing),
     (text) => text,
     (text) => element("li", { class: "warning given", text }),
   );
-  showFacts(byId("server-facts"), factsOf(listing));
-  byId("server").hidden = false;
+  showFacts(byId("now"), figures());
+  byId("now").className = looks.requests("rate")[1] > 0 ? "failing" : "";
+  showFacts(byId("server-facts"), facts());
+  showPast(listing);
+  byId("history").hidden = false;
   const what = `${listing.policies.length} ${listing.policies.length === 1 ? "policy" : "policies"}`;
-  setText(byId("state"), `${what} served. Asked again every ${EVERY_MS / 1000} seconds.`);
+  setText(byId("state"), `${what} served`);
   document.title = `rlservo: ${what}`;
 }
 
@@ -197,31 +201,63 @@ function warningsOf({ behind }) {
   return warnings.map((text) => clip(text, 1000));
 }
 
-function factsOf({ generation, changed_at: changedAt, changed_by: changedBy }) {
-  const replicas = looks.replicas.filter(Boolean);
-  const refusals = [...looks.totalBy("rlservo_requests_total", "code", { version: "" })];
-  const several = "the figures are the sum of what these said within the last minute, each since its start";
-  const change = changedAt && `${new Date(changedAt).toLocaleString()}: ${clip(changedBy ?? "", 200)}`;
-  const waited = looks.newest.map((samples) => samples.get("rlservo_queue_longest")?.[0]?.value ?? 0);
+/** Return the state of the whole server, in one line. */
+function figures() {
+  const uptimes = looks.newest.map((samples) => samples.get("rlservo_uptime_seconds")?.[0]?.value ?? 0);
+  const [answered, failed] = looks.requests("rate");
   return [
-    ["Replicas that answered", replicas.length > 1 ? `${replicas.join(", ")}; ${several}` : replicas.join("")],
-    ["Last change", change && `${change} (plan ${generation})`],
-    ["Refused before a version was chosen", refusals.map(([code, count]) => `${code} ${count}`).join(", ")],
-    ["Most requests that waited at once", String(Math.max(0, ...waited))],
-    ["Not counted", "what a proxy refuses before a replica sees it"],
-    ["Last answer", clock(new Date())],
+    ["Server", location.host],
+    ["Up", sayDuration(Math.min(...uptimes))],
+    ["Requests", `${number(answered, 3)} /s`],
+    ["Latency p50 / p99", sayLatency(looks.quantiles("rlservo_request_seconds", {}, [0.5, 0.99]))],
+    ["Errors", `${number(failed, 2)} /s, ${looks.requests("total")[1]} in all`],
+    ["Sessions", String(looks.total("rlservo_sessions"))],
   ];
 }
 
-function note(sentence) {
-  const time = element("time", { text: clock(new Date()) });
-  byId("history").hidden = false;
-  byId("changes").prepend(element("li", { class: "given" }, time, ` ${sentence}`));
-  while (byId("changes").children.length > MOST_CHANGES) byId("changes").lastChild.remove();
+function sayDuration(seconds) {
+  const days = Math.floor(seconds / 86400);
+  return `${days > 0 ? `${days} d ` : ""}${new Date(1000 * seconds).toISOString().slice(11, 19)}`;
 }
 
-function clock(date) {
-  return date.toLocaleTimeString([], { hour12: false });
+function facts() {
+  const replicas = looks.replicas.filter(Boolean);
+  const several = "the figures are the sum of what these said within the last minute, each since its start";
+  const refusals = [...looks.totalBy("rlservo_requests_total", "code", { version: "" })];
+  return [
+    ["Replicas that answered", replicas.length > 1 ? `${replicas.join(", ")}; ${several}` : replicas.join("")],
+    ["Refused before a version was chosen", refusals.map(([code, count]) => `${code} ${count}`).join(", ")],
+    ["Not counted", replicas.length > 1 ? "what a proxy refuses before a replica sees it" : ""],
+    ["Last answer", stamp(Date.now() / 1000)],
+  ];
+}
+
+// What has changed.
+
+function sayPlan({ generation, changed_by: by }) {
+  return `plan ${generation}${by ? `, ${clip(by, 200)}` : ""}`;
+}
+
+/** Show what the server itself says of its past. */
+function showPast({ policies, ...plan }) {
+  const events = policies.flatMap(({ name, version_states: versions }) =>
+    versions.map(({ version, loaded_at: at }) => [at, `${name}: version ${version} loaded`]),
+  );
+  for (const before of plan.recent) {
+    if (before.generation <= opened) events.push([before.changed_at, sayPlan(before)]);
+  }
+  const known = events.filter(([at]) => at).sort(([a], [b]) => (a < b ? 1 : -1));
+  keep(byId("past"), known, String, ([at, sentence]) => entry(at, sentence));
+}
+
+function entry(at, sentence) {
+  return element("li", { class: "given" }, element("time", { text: stamp(at) }), ` ${sentence}`);
+}
+
+function note(sentence) {
+  byId("history").hidden = false;
+  byId("changes").prepend(entry(Date.now() / 1000, sentence));
+  while (byId("changes").children.length > MOST_CHANGES) byId("changes").lastChild.remove();
 }
 
 byId("key-form").addEventListener("submit", takeKey);

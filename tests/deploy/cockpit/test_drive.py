@@ -13,16 +13,16 @@ import pytest
 from arms import LIMITS, RunningArm
 from bundles import write_leaky_policy
 from cockpits import served_on
+from rlservo.bundle.bundle import read_contract
 from rlservo.deploy.cockpit.drive import Drive
 from rlservo.deploy.cockpit.ghost import Ghost
-from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, Link, PolicySource, ServedPolicies
-from rlservo.deploy.cockpit.stage import Disturbance, Scene, Stage
-from rlservo.export.contract.bundle import read_contract
-from rlservo.export.contract.errors import UnavailableError, UsageError
+from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, PolicySource, ServedPolicies, ServerLink
+from rlservo.deploy.cockpit.stage import Scene, Stage, StageDisturbance
+from rlservo.errors import UnavailableError, UsageError
+from rlservo.recording.episodes import episodes
+from rlservo.recording.reader import Recording
+from rlservo.recording.recorder import Recorder
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.recording.episodes import episodes
-from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.recording.recorder import Recorder
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import over_uvicorn
 from stores import control_of, load_store
@@ -139,7 +139,7 @@ def test_disturbances_begin_with_an_episode_where_the_robot_stands(drives: Calla
     drive.do(drive.pause)
     wait_for(lambda: drive.view.phase == "paused", "it stands")
     robot, target = drive.view.after.robot, drive.view.after.target
-    drive.do(lambda: drive.disturb(Disturbance(action_latency=3, noise=0.05, payload=2.0)))
+    drive.do(lambda: drive.disturb(StageDisturbance(action_latency=3, noise=0.05, payload=2.0)))
     drive.do(drive.step)
     cycles = drive.history[-1].number
     wait_for(lambda: drive.history[-1].number > cycles or drive.view.phase == "paused", "a step")
@@ -195,11 +195,11 @@ def test_a_ghost_with_a_memory_has_one_of_its_own(two_versions: Path, tmp_path: 
             port = cleanup.enter_context(over_uvicorn(create_app(control_of(store), ServerSettings())))
             source = ServedPolicies(f"http://127.0.0.1:{port}")
         cleanup.callback(source.close)
-        policy, choice = source.open(Choice("ur5", "1"), Link()), Choice("ur5", "1")
+        policy, choice = source.open(Choice("ur5", "1"), ServerLink()), Choice("ur5", "1")
         cleanup.callback(policy.close)
         stage = Stage(ENV, {}, policy.contract)
         cleanup.callback(stage.close)
-        ghost = Ghost(source.open(choice, Link()), stage)
+        ghost = Ghost(source.open(choice, ServerLink()), stage)
         cleanup.callback(ghost.close)
         seen = []
         for _ in range(2):
@@ -216,7 +216,7 @@ def test_a_ghost_with_a_memory_has_one_of_its_own(two_versions: Path, tmp_path: 
             assert np.allclose(ghost.scenes[1].robot, stage.scene().robot, atol=1e-6)
             seen.append(actions)
         assert np.array_equal(seen[0], seen[1])  # an episode begins without a memory
-        fresh = source.open(choice, Link())
+        fresh = source.open(choice, ServerLink())
         cleanup.callback(fresh.close)
         assert np.abs(fresh.act(obs) - policy.act(obs)).max() > 1e-3  # there is one
 
@@ -245,7 +245,7 @@ def test_a_server_that_goes_away_is_waited_for_and_driven_on_with(two_versions: 
         assert drive.history[-1].number <= cycles + 1
         with served_on(app, free_port):
             wait_for(lambda: drive.view.trouble == "" and drive.history[-1].number > cycles + 3, "it drives on")
-            drive.do(lambda: drive.choose(Choice("ur5", "1"), Link(deadline_ms=500.0, fallback="hold")))
+            drive.do(lambda: drive.choose(Choice("ur5", "1"), ServerLink(deadline_ms=500.0, fallback="hold")))
             wait_for(lambda: drive.view.contract.version == "1", "version 1")
             cycles = drive.history[-1].number
             wait_for(lambda: drive.history[-1].number > cycles + 3, "it drives")

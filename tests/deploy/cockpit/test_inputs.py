@@ -26,8 +26,8 @@ from rlservo.deploy.cockpit.inputs import number_of, point_of
 from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import BundledPolicies, Choice
-from rlservo.serve_app.rollout.control_loop import rollout
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.drive.control_loop import rollout
+from rlservo.policy.policy import Policy
 from waiting import wait_for
 
 pytestmark = [

@@ -24,9 +24,9 @@ from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import BundledPolicies, Choice, PolicySource, ServedPolicies
 from rlservo.deploy.cockpit.scenery import OBSTACLE_LIFT, TARGET_LIFT
+from rlservo.drive.control_loop import rollout
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.rollout.control_loop import rollout
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import control_of, load_store
 from waiting import PATIENCE_S, wait_for
@@ -115,16 +115,21 @@ def driven(windows: Windows, source: PolicySource, choice: Choice, seed: int) ->
         yield drive, cockpit, window
 
 
-def drag(window: Browser, cockpit: Cockpit, start: Any, end: Any, has_moved: Callable[[], bool]) -> None:
-    """Drag what is at `start` to `end`; again where the mouse was quicker than a busy machine's next picture."""
+def drag(window: Browser, cockpit: Cockpit, place: Callable[[], Any], grip: Any, by: Any) -> None:
+    """Drag what is at `place`, by its handle at `grip` from there, until it has moved by half of `by` or more.
+
+    Again, from where it is then, where the mouse was quicker than a busy machine's next picture.
+    """
+    before = place()
     for patience_s in (10.0, 20.0, PATIENCE_S):
-        window.drag(cockpit.pixel(start), cockpit.pixel(end))
+        start = place() + grip
+        window.drag(cockpit.pixel(start), cockpit.pixel(start + by))
         deadline = time.monotonic() + patience_s
         while time.monotonic() < deadline:
-            if has_moved():
+            if (place() - before) @ by > 0.5 * by @ by:
                 return
             time.sleep(0.05)
-    raise AssertionError("it is not where it was dragged to")
+    raise AssertionError(f"it was dragged by {by}, and has moved by {place() - before}")
 
 
 def scrub(window: Browser, number: int) -> None:
@@ -154,11 +159,7 @@ def test_target_and_cubes_of_a_mir100_are_dragged_and_dropped(two_versions: Path
 
         for of, lift in (("target", TARGET_LIFT), ("cube", OBSTACLE_LIFT)):
             before = place(of)
-            handle = before + (0.0, 0.0, lift)
-            drag(
-                window, cockpit, handle + 0.6 * left, handle + 1.0 * left,
-                lambda of=of, before=before: place(of)[1] > before[1] + 0.2,
-            )  # fmt: skip
+            drag(window, cockpit, lambda of=of: place(of), 0.6 * left + (0.0, 0.0, lift), 0.4 * left)
             assert np.allclose(place(of)[[0, 2]], before[[0, 2]], atol=1e-3)
         window.click("Drop a cube ahead")
         robot = drive.view.after.robot
@@ -208,10 +209,7 @@ def test_the_handle_is_dragged_and_the_robot_reaches_the_new_target(
     before = drive.view.after.target
     assert before is not None
     up = np.array([0.0, 0.0, 1.0])
-    drag(
-        window, cockpit, before + ARROW_M * up, before + (ARROW_M + 0.12) * up,
-        lambda: (drive.view.after.target - before)[2] > 0.05,
-    )  # fmt: skip
+    drag(window, cockpit, lambda: drive.view.after.target, ARROW_M * up, 0.12 * up)
     assert np.allclose(drive.view.after.target[:2], before[:2], atol=1e-3)
     window.click("Play")
     window.wait_for("Arrived.")
@@ -219,6 +217,11 @@ def test_the_handle_is_dragged_and_the_robot_reaches_the_new_target(
     assert view.after.target is not None and np.linalg.norm(view.after.robot - view.after.target) <= 0.1
     window.click("New target")
     wait_for(lambda: drive.view.phase == "driving", "it goes on")
+
+
+def test_the_tab_has_a_title_and_the_page_a_legend(window: Browser) -> None:
+    assert window.page.title() == "rlservo cockpit"
+    window.wait_for("robot's path")
 
 
 def test_the_plots_move_and_the_table_tells_what_the_policy_sees(drive: Drive, window: Browser) -> None:

@@ -12,11 +12,11 @@ pytest.importorskip("viser", reason="the cockpit draws with viser")
 
 from cockpits import cockpit_of
 from rlservo.deploy.cockpit.watch import WatchPanel
-from rlservo.envs.robot_server.messages import ROBOT_SERVER, Action, State
-from rlservo.envs.robot_server.server import RobotServer
-from rlservo.envs.robot_server.settings import Mir100Settings, Settings, URSettings
+from rlservo.envs.robot_server.robo_gym_messages import ROBOT_SERVER, Action, State
+from rlservo.envs.robot_server.robot_server import RobotServer
+from rlservo.envs.robot_server.robot_server_settings import Mir100Settings, Settings, URSettings
 from rlservo.envs.robot_server.state_reader import RobotServerError, StateReader, env_of, show_state
-from rlservo.export.contract.errors import UnavailableError
+from rlservo.errors import UnavailableError
 from waiting import wait_for
 
 UR = URSettings(port=0, rs_mode="1object", action_cycle_rate=10.0, seed=1)

@@ -9,8 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from rlservo.deploy.cli import app
-from rlservo.export.contract.errors import BundleError, ConflictError
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.errors import BundleError, ConflictError
+from rlservo.policy.policy import Policy
 
 
 def test_a_bundle_is_published_under_its_own_and_the_next_free_number(ur5: Path, tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 
 from bundles import write_box_policy
 from command_line import rlservo_here
-from rlservo.serve_app.recording.recorded_policy import WithRecording
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
+from rlservo.recording.recorded_policy import WithRecording
 from ros import PYTHON, Ros
 
 # As `ros2 bag record` does it: rosbag2's own layout, by another implementation of it.

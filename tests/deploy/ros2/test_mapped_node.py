@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -15,7 +16,9 @@ import pytest
 
 from bundles import write_box_policy
 from environments import environment_with
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.bundle.bundle import read_contract, write_contract
+from rlservo.bundle.spaces import Element
+from rlservo.policy.policy import Policy
 from ros import PYTHON, Process, Ros, SlowServer
 from servers import free_ports, over_uvicorn
 
@@ -40,7 +43,28 @@ def mapping(path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_box_policy(tmp_path_factory.mktemp("mapped"))
+    """A policy that says that its third element is in degrees."""
+    path = write_box_policy(tmp_path_factory.mktemp("mapped"))
+    contract = read_contract(path)
+    elements = list(contract.observation_space.elements)
+    elements[2] = elements[2].model_copy(update={"unit": "deg"})
+    space = contract.observation_space.model_copy(update={"elements": tuple(elements)})
+    write_contract(path, contract.model_copy(update={"observation_space": space}))
+    return path
+
+
+@pytest.fixture
+def moving(bundle: Path, tmp_path: Path) -> Path:
+    """The same, whose first two actions are velocities."""
+    path = shutil.copytree(bundle, tmp_path / "ur5" / "1")
+    contract = read_contract(path)
+    velocities = (
+        Element(name="joint_0", quantity="linear velocity", unit="m/s", scale=0.5, offset=0.1),
+        Element(name="joint_1", quantity="angular velocity", unit="rad/s"),
+    )
+    space = contract.action_space.model_copy(update={"elements": (*velocities, *contract.action_space.elements[2:])})
+    write_contract(path, contract.model_copy(update={"action_space": space}))
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +160,54 @@ def test_node_holds_for_a_slow_and_for_a_lost_server_and_goes_on(ros: Ros, bundl
         until_state(ros, "running", act, "served")
 
 
+def test_velocities_are_zero_and_stops_are_sent_when_the_node_holds_stops_or_ends(ros: Ros, moving: Path) -> None:
+    twist, gripper, other = "/cmd_vel_mapped", "/gripper", "/positions"
+    kinds = {twist: "geometry_msgs/msg/Twist", gripper: "std_msgs/msg/Float64", other: "std_msgs/msg/Float64MultiArray"}
+    for topic, kind in {**kinds, "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray"}.items():
+        ros.ask("subscribe", topic=topic, kind=kind)
+    lines = [
+        f'action.joint_0: "{twist} {kinds[twist]} linear.x * 0.5 + 0.1"',
+        f'action.joint_1: "{twist} {kinds[twist]} angular.z"',
+        f'action.joint_2: "{gripper} {kinds[gripper]} data"',
+        "stop.joint_2: -0.25",
+        *(f'action.joint_{index}: "{other} {kinds[other]} data[{index - 3}]"' for index in range(3, 6)),
+    ]
+    parameters = mapping(moving.parent / "stops.yaml")
+    parameters.write_text("\n    ".join([parameters.read_text(), *lines]))
+    joints = {"shoulder": 0.3, "elbow": -0.2, "wrist": 0.1}
+    node = ros.rlservo(
+        "ros2", "--bundle", moving, "--mapping", parameters, "--max-age", MAX_AGE_S, "--name", "stops", "--autostart"
+    )
+    act = lambda: send(ros, joints)  # noqa: E731
+    until_state(ros, "waiting", node="stops")
+
+    def newest() -> list[Any]:
+        seen = {topic: ros.ask("since", topic=topic, time_s=0.0) for topic in kinds}
+        speeds = seen[twist][-1][1]
+        return [speeds["linear"]["x"], speeds["angular"]["z"], seen[gripper][-1][1]["data"], len(seen[other])]
+
+    def run_until_moving() -> None:
+        until_state(ros, "running", act, "stops")
+        ros.wait_until(lambda: (act(), newest()[0] != 0.0)[1])
+
+    for stop, state in (
+        (lambda: ros.ask("call", service="/stops/hold"), "holding: asked for"),
+        (lambda: ros.ask("call", service="/stops/stop"), "stopped: asked for"),
+        (lambda: None, "holding: the newest message"),
+    ):
+        run_until_moving()
+        stop()
+        until_state(ros, state, act if "asked" in state else lambda: None, "stops")
+        ros.wait_until(lambda: newest()[:3] == [0.0, 0.0, -0.25])
+        standing = newest()
+        time.sleep(0.3)
+        assert newest() == standing  # positions have no stop that is known: none is sent
+        ros.ask("call", service="/stops/start")
+    run_until_moving()
+    assert node.end() == 0
+    ros.wait_until(lambda: newest()[:3] == [0.0, 0.0, -0.25])
+
+
 def test_mapped_policy_drives_a_base_to_twenty_targets(ros: Ros, all_shipped: Path) -> None:
     places = {
         "observation.target_r": f"{TARGET} std_msgs/msg/Float64MultiArray data[0]",
@@ -177,9 +249,9 @@ def test_mapping_of_no_element_is_one_sentence(ros: Ros, bundle: Path) -> None:
 
 CHECK = """
 import sys
-from rlservo.deploy.ros2.elements import COMMANDED, READ, Place
-from rlservo.envs.robots.arm import RobotError
-from rlservo.export.contract.errors import UsageError
+from rlservo.deploy.ros2.mapped_elements import COMMANDED, READ, Place
+from rlservo.robots.arm_interface import RobotError
+from rlservo.errors import UsageError
 for side, text in (line.split(": ") for line in sys.stdin.read().splitlines()):
     try:
         Place.parse("x", text).check(COMMANDED if side == "action" else READ)

@@ -8,11 +8,11 @@ from typing import Any
 import grpc
 import pytest
 
-from rlservo.envs.robot_server import messages
+from rlservo.envs.robot_server import robo_gym_messages as messages
 from rlservo.envs.robot_server.manager import RobotServers, ServerManager
-from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER
-from rlservo.envs.robot_server.server import RobotServer
-from rlservo.envs.robot_server.settings import Settings
+from rlservo.envs.robot_server.robo_gym_messages import ROBOT_SERVER, SERVER_MANAGER
+from rlservo.envs.robot_server.robot_server import RobotServer
+from rlservo.envs.robot_server.robot_server_settings import Settings
 
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ROS_JOINTS = ("elbow", "shoulder", "base", "wrist_1", "wrist_2", "wrist_3")

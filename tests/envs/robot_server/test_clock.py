@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rlservo.envs.robot_server.clock import GRACE_S, Clock
-from rlservo.envs.robot_server.settings import Mir100Settings, URSettings
+from rlservo.envs.robot_server.robot_server_settings import Mir100Settings, URSettings
 
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 START = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)

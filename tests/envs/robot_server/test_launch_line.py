@@ -8,7 +8,7 @@ import time
 import pytest
 
 from rlservo.envs.robot_server.launch_line import parse_launch_line
-from rlservo.envs.robot_server.settings import (
+from rlservo.envs.robot_server.robot_server_settings import (
     Mir100Settings,
     PandaSettings,
     Settings,

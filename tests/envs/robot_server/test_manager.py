@@ -21,8 +21,8 @@ import pytest
 
 from rlservo.envs.robot_server.connections import count_connections
 from rlservo.envs.robot_server.manager import MANAGER_PORTS, RobotServers, ServerManager
-from rlservo.envs.robot_server.messages import ROBOT_SERVER, SERVER_MANAGER, Empty, ManagerStatus, State
-from rlservo.envs.robot_server.server import CannotListenError, PortInUseError, bind
+from rlservo.envs.robot_server.robo_gym_messages import ROBOT_SERVER, SERVER_MANAGER, Empty, ManagerStatus, State
+from rlservo.envs.robot_server.robot_server import PortInUseError, ServerAddressError, bind
 from rlservo.serve_app.engines.ports import listen
 from servers import free_ports
 from waiting import wait_for
@@ -182,7 +182,7 @@ def test_limit_of_servers_is_kept_and_freed_by_a_kill() -> None:
     finally:
         servers.close()
     assert servers.running == {}
-    with pytest.raises(ValueError, match="this server manager is ending"):
+    with pytest.raises(ValueError, match="this server manager is shutting down"):
         servers.start(UR)
 
 
@@ -201,7 +201,7 @@ def test_address_that_cannot_be_listened_on_is_named_with_its_true_reason(
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1] if port is None else port
-        with pytest.raises(CannotListenError) as caught:
+        with pytest.raises(ServerAddressError) as caught:
             bind(grpc.server(futures.ThreadPoolExecutor(1)), host, port)
     assert re.fullmatch(rf"cannot listen on {host}:{port}: ({reason}).*", str(caught.value))
     assert isinstance(caught.value, PortInUseError) == (reason == "the port is taken")
@@ -210,7 +210,7 @@ def test_address_that_cannot_be_listened_on_is_named_with_its_true_reason(
 OUT_OF_FILES = """
 import resource, grpc
 from concurrent import futures
-from rlservo.envs.robot_server.server import CannotListenError, bind
+from rlservo.envs.robot_server.robot_server import ServerAddressError, bind
 server, held = grpc.server(futures.ThreadPoolExecutor(1)), []
 resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
 try:
@@ -220,7 +220,7 @@ except OSError:
     pass
 try:
     bind(server, "127.0.0.1", 0)
-except CannotListenError as error:
+except ServerAddressError as error:
     held.clear()
     print(error)
 """
@@ -296,7 +296,7 @@ def robot_servers_of(pid: int) -> list[int]:
 def test_nothing_outlives_the_manager_however_it_ends(command: Any, end: signal.Signals) -> None:
     process, port = command("server-manager", "--port", str(free_ports(1)[0]))
     with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
-        from rlservo.envs.robot_server.messages import ServerRequest
+        from rlservo.envs.robot_server.robo_gym_messages import ServerRequest
 
         start = channel.unary_unary(f"/{SERVER_MANAGER}/StartNewServer", response_deserializer=ServerRequest.FromString)
         ports = [start(ServerRequest(cmd=line).SerializeToString(), timeout=60).port for line in (UR, MIR)]
@@ -355,7 +355,7 @@ def test_robot_server_command_serves_and_ends_on_ctrl_c(command: Any) -> None:
 
 HAMMERED = """
 import os, subprocess, sys
-from rlservo.envs.robot_server.server import arrives, stop_signals
+from rlservo.envs.robot_server.robot_server import arrives, stop_signals
 signals = stop_signals()
 send = f"import os, time\\nfor _ in range(10_000): os.kill({os.getpid()}, 15); time.sleep(0.0001)"
 sender = subprocess.Popen([sys.executable, "-c", send])
@@ -372,7 +372,7 @@ def test_a_signal_at_any_moment_of_the_wait_is_survived() -> None:
 
 SIGNALLED_ELSEWHERE = """
 import signal, threading, time
-from rlservo.envs.robot_server.server import arrives, stop_signals
+from rlservo.envs.robot_server.robot_server import arrives, stop_signals
 signals = stop_signals()
 threading.Timer(0.5, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGTERM)).start()
 assert arrives(signals)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.envs.mir100.simulation import Mir100Simulation
-from rlservo.envs.robot_server.settings import Mir100Settings
+from rlservo.envs.robot_server.robot_server_settings import Mir100Settings
+from rlservo.robots.mir100.simulation import Mir100Simulation
 
 CUBES = [-2.0, 0.5, 0.3, 0.1, -0.2, 0.0, 2.0, 0.4, -1.0]
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from rlservo.envs.panda.end_effector_positioning import EndEffectorPositioningPandaSim
+from rlservo.envs.robot_server.robot_server_settings import PandaSettings
 from rlservo.envs.robot_server.robots.robot import RobotState
-from rlservo.envs.robot_server.settings import PandaSettings
 from rlservo.envs.robot_server.state_reader import env_of, quantities, show_state
 
 START = [-0.018, -0.76, 0.02, -2.342, 0.03, 1.541, 0.753]

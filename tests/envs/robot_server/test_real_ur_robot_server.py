@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from arms import RunningArm
-from rlservo.envs.robot_server.settings import URSettings
+from rlservo.envs.robot_server.robot_server_settings import URSettings
 
 pytest.importorskip("rtde_control")
 

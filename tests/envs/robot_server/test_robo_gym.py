@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from rlservo.envs.robot_server.manager import ServerManager
-from rlservo.envs.robot_server.settings import Mir100Settings, URSettings
-from rlservo.envs.ur.parameters import UR_PARAMETERS
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.envs.robot_server.robot_server_settings import Mir100Settings, URSettings
+from rlservo.robots.ur.parameters import UR_PARAMETERS
+from rlservo.robots.ur.simulation import URSimulation
 
 pytestmark = [
     pytest.mark.slow,

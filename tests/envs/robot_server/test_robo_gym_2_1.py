@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from rlservo.envs.panda.end_effector_positioning import EndEffectorPositioningPandaSim
-from rlservo.envs.panda.model import HIGH, LOW
 from rlservo.envs.robot_server.launch_line import parse_launch_line
 from rlservo.envs.ur.isaac_reach import DEFAULT_JOINTS, IsaacReachURSim
+from rlservo.robots.panda.model import HIGH, LOW
 
 UR_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 PANDA_JOINTS = tuple(f"joint{number}" for number in range(1, 8))

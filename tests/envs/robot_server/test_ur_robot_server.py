@@ -14,9 +14,9 @@ import grpc
 import numpy as np
 import pytest
 
-from rlservo.envs.robot_server.settings import URSettings
-from rlservo.envs.ur.parameters import UR_PARAMETERS
-from rlservo.envs.ur.simulation import URSimulation
+from rlservo.envs.robot_server.robot_server_settings import URSettings
+from rlservo.robots.ur.parameters import UR_PARAMETERS
+from rlservo.robots.ur.simulation import URSimulation
 
 JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 START = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from rlservo.errors import CheckpointError
 from rlservo.export.checkpoints.experiment import best_checkpoint
-from rlservo.export.contract.errors import CheckpointError
 
 METRIC = "env_runners/episode_return_mean"
 

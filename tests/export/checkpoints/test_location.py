@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.location import locate_checkpoint, locate_modules
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError
 from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.export.graph.onnx_file import run_onnx
 from rlservo.export.rllib.restore import restore

@@ -9,8 +9,8 @@ from pathlib import Path
 import fsspec
 import pytest
 
+from rlservo.errors import CheckpointError, UnsupportedError, UsageError
 from rlservo.export.checkpoints.remote import fetch
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError, UsageError
 from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.export.verify_bundle import verify_bundle
 

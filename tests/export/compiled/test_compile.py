@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from command_line import rlservo_here
+from rlservo.bundle.spaces import BoxSpec, Element
+from rlservo.errors import ParityError, UsageError
 from rlservo.export.compiled import proof
 from rlservo.export.compiled.compile import Compiled, compile_bundle
-from rlservo.export.contract.errors import ParityError, UsageError
-from rlservo.export.contract.spaces import BoxSpec, Element
-from rlservo.serve_app.runtime.compiled_policy import CompiledPolicy
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.compiled_policy import CompiledPolicy
+from rlservo.policy.policy import Policy
 
 if TYPE_CHECKING:
     from rlservo.export.export_checkpoint import ExportResult
@@ -169,13 +169,13 @@ def test_policies_of_every_kind_act_as_in_onnxruntime(
 
 
 def policy_inputs(policy: Policy) -> dict[str, np.ndarray]:
-    from rlservo.export.contract.bundle import load_bundle
+    from rlservo.bundle.bundle import load_bundle
 
     golden, _ = load_bundle(policy.path).golden()
     return {name: array for name, array in golden.items() if name.startswith("obs")}
 
 
 def _observation(policy: Policy, leaves: dict[str, np.ndarray]) -> object:
-    from rlservo.export.contract.nested import build_action
+    from rlservo.bundle.nested import build_action
 
     return build_action(policy.contract.observation_space, leaves, "obs")

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
 from bundles import PARITY, PROVENANCE, save_graph, write_bundle
+from rlservo.bundle.contract import BakedStep, Contract, TensorSpec
+from rlservo.bundle.spaces import BoxSpec
+from rlservo.errors import UnsupportedError
 from rlservo.export.compiled.compile import compile_bundle
-from rlservo.export.contract.contract import BakedStep, Contract, TensorSpec
-from rlservo.export.contract.errors import UnsupportedError
-from rlservo.export.contract.spaces import BoxSpec
 
 WIDTH = 60  # of the observation: as a plane of 2 x 5 x 6, or a table of 10 x 6
 RNG = np.random.default_rng(0)

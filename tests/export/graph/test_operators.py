@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +21,13 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from rlservo.export.contract.errors import UnsupportedError
+from rlservo.errors import UnsupportedError
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.operators import EXACT, exact_operators
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.torchscript_file import run_torchscript, write_torchscript
 from rlservo.export.recipe.recipe import Recipe, UserStep
+from rlservo.policy.integer_division import with_floating_divisors
 
 TURN = 2 * math.pi
 SPECIAL = [
@@ -81,6 +85,10 @@ def summed(function: Function, degree: int = 1, **how: Any) -> Operator:
 
 def constant(obs: Tensor, *numbers: float) -> Tensor:
     return torch.tensor(numbers, dtype=obs.dtype)
+
+
+def integer_divisions(n: Tensor, by: Tensor) -> tuple[Tensor, ...]:
+    return n // by, n % by, torch.div(n, by, rounding_mode="trunc"), torch.remainder(n, by), n.floor_divide(by)
 
 
 def quaternion_product(obs: Tensor) -> Tensor:
@@ -182,6 +190,12 @@ OPERATORS: dict[str, Operator] = {
     "integers_floor_divide": exact(of_integers(lambda n: torch.floor_divide(n, n.abs() + 3))),
     "integers_div_trunc": exact(of_integers(lambda n: torch.div(n, 7, rounding_mode="trunc"))),
     "integers_modulo": exact(of_integers(lambda n: n % 7)),
+    "integers_by_negative": exact(of_integers(lambda n: torch.cat((n // -7, n % -7, n // -1, n % -1), 1))),
+    "integers_by_integers": exact(
+        of_integers(lambda n: torch.cat((*integer_divisions(n, n.abs() + 3), *integer_divisions(n, -3 - n.abs())), 1))
+    ),
+    "integer_by_integers": exact(of_integers(lambda n: torch.cat((100 // (n.abs() + 3), 100 % (-3 - n.abs())), 1))),
+    "integers_by_number": exact(of_integers(lambda n: torch.cat((n % 2.5, n // 2.5, torch.div(n, 0.5)), 1))),
     "round": exact(of_each(torch.round)),
     "round_decimals": exact(of_each(lambda x: torch.round(x, decimals=2)), limit=1e30),
     "round_tens": exact(of_each(lambda x: torch.round(x, decimals=-1))),
@@ -360,6 +374,27 @@ def test_an_operator_gives_torchs_own_numbers_in_both_formats(name: str, dtype: 
     write_torchscript(graph, example, tmp_path / "policy.ts")
     run = run_torchscript(tmp_path / "policy.ts", graph.input_names, graph.output_names)
     np.testing.assert_array_equal(run({"obs": obs})["action"], expected)
+
+
+SMALLEST = """import sys
+from pathlib import Path
+import numpy as np
+from rlservo.export.graph.onnx_file import run_onnx
+obs = np.array([[-(2.0**63), -1, 0, 0, 0, 0], [7, -2, 0, 0, 0, 0]], np.float32)
+print(run_onnx(Path(sys.argv[1]))({"obs": obs})["action"].tolist())
+"""
+
+
+def test_the_smallest_integer_by_minus_one_does_not_end_the_process(tmp_path: Path) -> None:
+    def divided(obs: Tensor) -> Tensor:
+        return torch.stack(integer_divisions(obs[:, 0].long(), obs[:, 1].long()), 1)
+
+    example = {"obs": np.array([[9, 4, 0, 0, 0, 0], [9, -4, 0, 0, 0, 0]], np.float32)}
+    write_onnx(graph_of(divided, np.float32), example, tmp_path / "policy.onnx")
+    done = subprocess.run([sys.executable, "-c", SMALLEST, tmp_path / "policy.onnx"], capture_output=True, text=True)
+    assert done.returncode == 0, done
+    assert json.loads(done.stdout) == [[-(2.0**63), 0, -(2.0**63), 0, -(2.0**63)], [-4, -1, -3, -1, -4]]
+    assert with_floating_divisors((tmp_path / "policy.onnx").read_bytes()) is None
 
 
 def test_every_composition_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ import torch
 from gymnasium.spaces import Box
 from torch import Tensor, nn
 
-from rlservo.export.contract.errors import UnsupportedError
+from rlservo.errors import UnsupportedError
 from rlservo.export.graph import why_not_exportable
 from rlservo.export.graph.onnx_file import write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph

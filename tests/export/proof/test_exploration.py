@@ -1,4 +1,4 @@
-"""Exploring actions: drawn in numpy by the runtime, distributed as RLlib draws them for every algorithm.
+"""Exploratory actions: drawn in numpy by the runtime, distributed as RLlib draws them for every algorithm.
 
 Both draw for one observation many times; what reaches the environment is compared, so that a wrong scale, a missing
 squashing or a missing unsquash shows. Two samples of one distribution stay within the bound of Kolmogorov and Smirnov
@@ -17,14 +17,14 @@ import torch
 from ray.rllib.core.columns import Columns
 from ray.rllib.policy.sample_batch import SampleBatch
 
+from rlservo.errors import RequestError
 from rlservo.export.checkpoints.location import CheckpointFiles, locate_checkpoint
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.errors import RequestError
 from rlservo.export.export_checkpoint import ExportResult
 from rlservo.export.recipe.trees import named_leaves
 from rlservo.export.rllib.restore import restore
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 DRAWS = 1200
 BOUND = 2.23 * np.sqrt(2 / DRAWS)  # sqrt(-log(1e-4 / 2) / 2), for two samples of one size

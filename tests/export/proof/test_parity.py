@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,13 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlservo.bundle.contract import Parity
+from rlservo.errors import ParityError
 from rlservo.export.checkpoints.location import locate_checkpoint
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.contract import Parity
-from rlservo.export.contract.errors import ParityError
+from rlservo.export.export_checkpoint import comparer_of
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
-from rlservo.export.proof.parity import GraphLoop, prove, record, record_perturbed
+from rlservo.export.proof.parity import GraphLoop, prove
+from rlservo.export.proof.references import record
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe, Transform
 from rlservo.export.recipe.runners import Outputs, Runner, first_step
 from rlservo.export.recipe.samples import BATCH_SIZES, draw_batches
@@ -46,8 +47,8 @@ def prove_as(checkpoint: RestoredPolicy, recipe: Recipe, tmp_path: Path) -> Pari
     pair = next(one.batch for one in references if len(one.batch) == 2)
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(pair.inputs, np.ones(2, np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
-    perturb = functools.partial(record_perturbed, checkpoint.start_loop, references)
-    return prove(checkpoint.recipe, references, {"onnx": run_onnx(tmp_path / "policy.onnx")}, perturb=perturb)
+    comparer = comparer_of(checkpoint, graph, references)
+    return prove(checkpoint.recipe, references, {"onnx": run_onnx(tmp_path / "policy.onnx")}, comparer=comparer)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "unbounded", "offset", "grid", "double"])

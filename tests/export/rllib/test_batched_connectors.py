@@ -16,7 +16,7 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.filter import RunningStat
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 from rlservo.export.rllib import batched_connectors
 from rlservo.export.rllib.batched_connectors import check_filter, supports, use_batched_connectors
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,20 +11,22 @@ from typing import Any
 import numpy as np
 import pytest
 
+from checkpoints import ZOO
+from rlservo.errors import CheckpointError, ParityError
 from rlservo.export.checkpoints.location import CheckpointFiles
-from rlservo.export.contract.errors import CheckpointError, ParityError
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
 from rlservo.export.prune_checkpoint import prune_checkpoint
 from rlservo.export.reports import export_report
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")
 
 
 @pytest.fixture
-def export(app: Path, tmp_path: Path, notices: list[str]) -> Callable[..., ExportResult]:
+def export(tmp_path: Path, notices: list[str]) -> Callable[..., ExportResult]:
     def export(checkpoint: Path, **options: Any) -> ExportResult:
-        return export_checkpoint(checkpoint, tmp_path / "out", app_dir=app, notify=notices.append, **options)
+        options = {"app_dir": ZOO, **options}  # it has the module of the configurations' functions
+        return export_checkpoint(checkpoint, tmp_path / "out", notify=notices.append, **options)
 
     return export
 
@@ -57,6 +60,16 @@ def test_the_statistics_are_trainings_wherever_rllib_saved_them(
     assert_acts_as_restored(result, layout_zoo / f"{name}.npz")
     prune_checkpoint(layout_zoo / name, tmp_path / "pruned", app_dir=tmp_path, notify=lambda _: None)
     assert export(tmp_path / "pruned").contract.baked_in == result.contract.baked_in
+
+
+def test_a_configuration_whose_functions_are_elsewhere_asks_for_their_folder(
+    layout_zoo: Path, app: Path, export: Callable[..., ExportResult], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "train_zoo", raising=False)  # another test's, as the path
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry).name != ZOO.name])
+    words = r"local_evaluated: the connector pipelines cannot be built .* module 'train_zoo', .*--app-dir"
+    with pytest.raises(CheckpointError, match=words):
+        export(layout_zoo / "local_evaluated", app_dir=app)
 
 
 def test_every_module_finds_its_agents_statistics_at_the_root(

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlservo.errors import CheckpointError, UnsupportedError, UsageError
 from rlservo.export.checkpoints.location import MODULES, locate_checkpoint
-from rlservo.export.contract.errors import CheckpointError, UnsupportedError, UsageError
 from rlservo.export.export_checkpoint import ExportResult, export_all_modules, export_checkpoint
 from rlservo.export.prune_checkpoint import prune_checkpoint
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 MODULE_OF = {"left": "arms", "right": "arms", "base": "wheels"}
 

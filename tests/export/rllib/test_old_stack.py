@@ -3,39 +3,48 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import pickle
 import shutil
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Box, Dict, Discrete
 from numpy.typing import NDArray
+from ray.rllib.connectors.agent.obs_preproc import ObsPreprocessorConnector
+from ray.rllib.connectors.agent.pipeline import AgentConnectorPipeline
+from ray.rllib.connectors.agent.state_buffer import StateBufferConnector
+from ray.rllib.connectors.connector import ConnectorContext
+from ray.rllib.models.preprocessors import get_preprocessor
+from ray.rllib.policy.sample_batch import SampleBatch
 
+from rlservo.bundle.bundle import load_bundle
+from rlservo.bundle.contract import Parity
+from rlservo.errors import CheckpointError, ParityError, RequestError, RlservoError, UnsupportedError
 from rlservo.export.checkpoints.location import locate_checkpoint
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.checkpoints.unpickle import user_code
-from rlservo.export.contract.bundle import load_bundle
-from rlservo.export.contract.contract import Parity
-from rlservo.export.contract.errors import CheckpointError, ParityError, RequestError, RlservoError, UnsupportedError
-from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
+from rlservo.export.export_checkpoint import ExportResult, comparer_of, export_checkpoint
 from rlservo.export.graph.onnx_file import run_onnx, write_onnx
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.graph.torchscript_file import run_torchscript
-from rlservo.export.proof.parity import GraphLoop, prove, record, record_perturbed
+from rlservo.export.proof.parity import GraphLoop, prove
+from rlservo.export.proof.references import record
 from rlservo.export.prune_checkpoint import prune_checkpoint
 from rlservo.export.recipe.recipe import ObservationFilter, Preprocess, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Loop, first_step
 from rlservo.export.recipe.samples import draw_batches
+from rlservo.export.rllib.old_stack.connectors import read_old_steps
 from rlservo.export.rllib.old_stack.custom_models import Registration, find_registrations
 from rlservo.export.rllib.restore import restore
 from rlservo.export.sources.restored_policy import RestoredPolicy
 from rlservo.export.verify_bundle import verify_bundle
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 STATE = "policies/default_policy/policy_state.pkl"
 EXPORTED = [
@@ -113,6 +122,19 @@ def spec_leaves(space: Any, name: str) -> dict[str, Any]:
         return {name: space}
     children = inside.items() if isinstance(inside, dict) else enumerate(inside)
     return {path: leaf for key, child in children for path, leaf in spec_leaves(child, f"{name}.{key}").items()}
+
+
+def test_parts_whose_order_the_environment_decides_are_refused() -> None:
+    parts = [("wheels", Box(-1.0, 1.0, (2,), np.float32)), ("arm", Box(-1.0, 1.0, (2,), np.float32))]
+    obs = {"wheels": np.zeros(2, np.float32), "arm": np.ones(2, np.float32)}
+    for space, refused in ((Dict(parts), True), (Dict(sorted(parts)), False)):
+        preprocessor = get_preprocessor(space)(space)
+        assert list(preprocessor.transform(obs)) == [1.0, 1.0, 0.0, 0.0]
+        assert list(preprocessor.transform(OrderedDict(obs))) == [0.0, 0.0, 1.0, 1.0]
+        context = ConnectorContext(config={}, observation_space=preprocessor.observation_space)
+        pieces = AgentConnectorPipeline(context, [ObsPreprocessorConnector(context)])
+        with pytest.raises(UnsupportedError, match="not in sorted order") if refused else nullcontext():
+            assert len(read_old_steps(pieces)) == 1
 
 
 def assert_same_actions(got: Mapping[str, NDArray[Any]], seen: Mapping[str, NDArray[Any]]) -> None:
@@ -268,8 +290,8 @@ def prove_as(restored: RestoredPolicy, recipe: Recipe, tmp_path: Path) -> Parity
     last = references[-1].batch
     example = GraphLoop(lambda inputs: inputs, recipe.state).complete(last.inputs, np.ones(len(last), np.bool_))
     write_onnx(graph, example, tmp_path / "policy.onnx")
-    perturb = functools.partial(record_perturbed, restored.start_loop, references)
-    return prove(restored.recipe, references, {"onnx": run_onnx(tmp_path / "policy.onnx")}, (), "old", perturb)
+    comparer = comparer_of(restored, graph, references)
+    return prove(restored.recipe, references, {"onnx": run_onnx(tmp_path / "policy.onnx")}, (), "old", comparer)
 
 
 @pytest.mark.parametrize("name", ["pendulum", "unbounded", "offset", "grid", "double", "sac", "filtered_beams"])
@@ -344,7 +366,7 @@ def test_the_old_stack_reference_does_not_drift(load: Callable[..., RestoredPoli
         ),
         ("clock_reader", UnsupportedError, r"OldClockReader reads 't' besides the observation"),
         ("clipped_limbs", UnsupportedError, r"parts that are unsquashed and parts that are only clipped"),
-        ("batch_reader", ParityError, r"a batch of 257 likely observations: output 'action_dist_inputs', element 0"),
+        ("batch_reader", UnsupportedError, "depends on the other observations of the batch"),
         ("several", CheckpointError, r"holds 2 policies \(arm, cart\): name the one to export with --module-id"),
     ],
 )
@@ -611,3 +633,33 @@ def test_a_pruned_old_stack_checkpoint_exports_to_the_same_policy(
         contracts.append(result.contract.model_dump(mode="json"))
         contracts[-1]["provenance"].pop("exported_at")
     assert contracts[0] == contracts[1]
+
+
+@pytest.mark.parametrize("name", ["continuous_lstm", "pendulum"])
+def test_the_gates_reference_acts_over_episodes_and_forgets_those_of_another_loop(
+    old_zoo: Path, load: Callable[..., RestoredPolicy], name: str
+) -> None:
+    restored, seen = load(name), np.load(old_zoo / f"{name}.npz")
+    for begins in (True, False):  # a new loop has no earlier episode that it could continue
+        loop = restored.start_loop()
+        for step, restart in enumerate(seen["restart"]):
+            given = {"obs": seen["obs"][[step]], "reward": np.array([0.5], np.float32)}
+            found = loop.step(given, np.array([restart and (step > 0 or begins)]))
+            np.testing.assert_allclose(found["action"][0], seen["action"][step], rtol=1e-5, atol=2e-6)
+
+
+def test_the_gates_reference_gives_connectors_the_last_reward_and_the_time(
+    old_zoo: Path, load: Callable[..., RestoredPolicy], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[tuple[Any, Any]] = []
+    transform = StateBufferConnector.transform
+
+    def watched(self: Any, data: Any) -> Any:
+        given.append((data.data.get(SampleBatch.REWARDS), data.data[SampleBatch.T]))
+        return transform(self, data)
+
+    monkeypatch.setattr(StateBufferConnector, "transform", watched)
+    loop, seen = load("pendulum").start_loop(), np.load(old_zoo / "pendulum.npz")
+    for step in range(3):
+        loop.step({"obs": seen["obs"][[step]], "reward": np.array([step], np.float32)}, np.array([step == 0]))
+    assert given == [(None, -1), (1.0, 0), (2.0, 1)]

@@ -16,13 +16,13 @@ import pytest
 from ray.rllib.algorithms.ppo.ppo_catalog import PPOCatalog
 from ray.rllib.algorithms.ppo.torch.default_ppo_torch_rl_module import DefaultPPOTorchRLModule
 
+from rlservo.errors import UnsupportedError
 from rlservo.export.checkpoints.facts import read_facts
 from rlservo.export.checkpoints.location import locate_checkpoint
 from rlservo.export.checkpoints.unpickle import unpickle, user_code
-from rlservo.export.contract.errors import UnsupportedError
 from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.export.prune_checkpoint import prune_checkpoint
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 OLDER_RAYS = Path(__file__).resolve().parents[2] / "older_rays"  # also the user's own code that they need
 

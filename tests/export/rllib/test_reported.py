@@ -13,15 +13,15 @@ import pytest
 from gymnasium.spaces import Box
 
 from command_line import rlservo_here
+from rlservo.bundle.bundle import read_contract
+from rlservo.bundle.spaces import DictSpec
+from rlservo.errors import CheckpointError, ObservationError, UnsupportedError
 from rlservo.export.checkpoints.unpickle import unpickle
-from rlservo.export.contract.bundle import read_contract
-from rlservo.export.contract.errors import CheckpointError, ObservationError, UnsupportedError
-from rlservo.export.contract.spaces import DictSpec
 from rlservo.export.export_checkpoint import ExportResult, export_all_modules, export_checkpoint
 from rlservo.export.recipe.recipe import Recipe, StateLeaf
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.verify_bundle import verify_bundle
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*PPOTorchRLModule.*:DeprecationWarning")
 
@@ -62,6 +62,20 @@ def assert_acts_as_recorded(result: ExportResult, file: Path) -> None:
 )
 def test_the_export_acts_as_rllib_did(reported_zoo: Path, export: Callable[..., ExportResult], name: str) -> None:
     assert_acts_as_recorded(export(name, value=name != "asymmetric"), reported_zoo / f"{name}.npz")
+
+
+def test_a_network_that_reads_parts_in_their_order_is_given_rllibs(
+    reported_zoo: Path, export: Callable[..., ExportResult]
+) -> None:
+    assert_acts_as_recorded(export("in_order"), reported_zoo / "in_order.npz")
+    assert_acts_as_recorded(export("out_of_order_flat"), reported_zoo / "out_of_order_flat_robot.npz")
+
+
+def test_a_network_that_reads_parts_in_the_environments_order_is_refused(
+    export: Callable[..., ExportResult],
+) -> None:
+    with pytest.raises(UnsupportedError, match=r"changes from .* when its keys come in the opposite order"):
+        export("out_of_order")
 
 
 @pytest.mark.parametrize("name", ["asymmetric", "removed_key"])

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import CheckpointError, RlservoError, UnsupportedError
+from rlservo.errors import CheckpointError, RlservoError, UnsupportedError
 from rlservo.export.export_checkpoint import export_checkpoint
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
@@ -46,6 +46,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequ
             ref=0.5 * net(seen),
             kind=leapp.OutputKindEnum.JOINT_POSITION,
             element_names=[["a", "b", "c"]],
+            extra={"units": ["rad", "rad", "m"]},
         )
         leapp.annotate.output_tensors("network", [target], export_with=format)
     leapp.stop()
@@ -65,9 +66,12 @@ def test_stages_are_chained_and_kinds_become_names_and_units(bundle: Path, tmp_p
     result = export_checkpoint(bundle, tmp_path, notify=notices.append)
     contract = result.contract
     assert not any("loading" in notice for notice in notices)
-    assert [(e.name, e.unit) for e in contract.action_space.elements] == [("a", "rad"), ("b", "rad"), ("c", "rad")]
+    assert [(e.name, e.unit) for e in contract.action_space.elements] == [("a", "rad"), ("b", "rad"), ("c", "m")]
     joints = contract.observation_space.spaces["q"]  # type: ignore[union-attr]
-    assert [(e.name, e.unit) for e in joints.elements] == [("pan", "rad"), ("lift", "rad")]
+    assert [(e.name, e.unit) for e in joints.elements] == [("pan", ""), ("lift", "")]
+    assert [(e.quantity, e.joint) for e in joints.elements] == [("joint position", "pan"), ("joint position", "lift")]
+    assert {e.quantity for e in contract.action_space.elements} == {"joint position"}
+    assert [notice for notice in notices if "whether a joint turns or slides, so before/q get no unit" in notice]
     assert contract.control_rate_hz == 20.0
     assert [leaf.initial for leaf in contract.state] == [0.25]
     rng = np.random.default_rng(0)
@@ -90,7 +94,10 @@ def test_stages_are_chained_and_kinds_become_names_and_units(bundle: Path, tmp_p
         (("backend: (jit|onnx)", "backend: pt2"), UnsupportedError, "backend 'pt2': only TorchScript and ONNX can be"),
         ((r"model_path: before\.", "model_path: after."), CheckpointError, "after.(pt|onnx) is not beside it"),
         (("sha256sum: ", "sha256sum: 0"), CheckpointError, "cannot be loaded by LEAPP"),
-        ((r"shape: \[1, 2\]", "shape: [2]"), UnsupportedError, r"has shape \[2\]: expected 1 for the batch, first"),
+        ((r"shape: \[1, 2\]", "shape: [9]"), CheckpointError, "do not run on tensors as it describes them"),
+        (("warp_segments: 0", "warp_segments: 1"), UnsupportedError, "'before' has 1 Warp segments .*WrpRunner"),
+        ((r"(?s)outputs:\n    network:.*?\n", "outputs: {}\n"), UnsupportedError, "has no outputs"),
+        (("name: q", "nam: q"), CheckpointError, "is not as LEAPP writes it: KeyError: 'name'"),
     ],
 )
 def test_broken_bundles_are_refused_with_the_reason(
@@ -130,7 +137,7 @@ def test_an_onnx_stage_gives_what_onnxruntime_gives_for_each_row(tmp_path: Path)
         )  # fmt: skip
     rows = torch.randn(5, 6)
     with torch.no_grad():
-        found = OnnxStage(file, ["x"], ["y", "z"])(rows)
+        found = OnnxStage(file)(rows)
     session = onnxruntime.InferenceSession(str(file))
     wanted = [session.run(None, {"x": row[None].numpy()}) for row in rows]
     for ours, theirs in zip(found, zip(*wanted, strict=True), strict=True):
@@ -144,4 +151,35 @@ def test_an_onnx_stage_of_an_operation_that_is_not_known_is_refused_by_name(tmp_
     x, y = (onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, 3]) for name in "xy")
     onnx.save(onnx.helper.make_model(onnx.helper.make_graph([node], "stage", [x], [y])), str(tmp_path / "stage.onnx"))
     with pytest.raises(UnsupportedError, match=r"stage.onnx has the operation Hardmax, .* export_with='jit-trace'"):
-        OnnxStage(tmp_path / "stage.onnx", ["x"], ["y"])
+        OnnxStage(tmp_path / "stage.onnx")
+
+
+@pytest.mark.parametrize(("parts", "order"), [("xyzw", "xyzw"), ("wxyz", "")])
+def test_pose_command_of_isaac_labs_betas_does_not_tell_its_order(
+    parts: str, order: str, tmp_path: Path, notices: list[str]
+) -> None:
+    """3.0's betas name the parts w, x, y, z, and give x, y, z, w."""
+    leapp = pytest.importorskip("leapp")
+    torch.manual_seed(0)
+    net = torch.nn.Linear(7, 2).eval().requires_grad_(False)
+    leapp.start("reach", save_path=str(tmp_path / "leapp"), max_cached_io=2)
+    for _ in range(2):
+        pose = leapp.TensorSemantics(
+            name="pose", ref=torch.randn(1, 7), kind=leapp.InputKindEnum.COMMAND_POSE,
+            element_names=[["x", "y", "z", *(f"q{part}" for part in parts)]], extra={"frame": "base"},
+        )  # fmt: skip
+        seen = _only(leapp.annotate.input_tensors("act", [pose]))
+        target = leapp.TensorSemantics(name="target", ref=net(seen), kind=leapp.OutputKindEnum.JOINT_VELOCITY,
+                                       element_names=[["a", "b"]], extra={"units": "rad/s"})  # fmt: skip
+        leapp.annotate.output_tensors("act", [target], export_with="jit-trace")
+    leapp.stop()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        leapp.compile_graph(visualize=False)
+    contract = export_checkpoint(tmp_path / "leapp" / "reach", tmp_path, notify=notices.append).contract
+    elements = contract.observation_space.elements
+    assert [(one.quantity, one.axis, one.frame) for one in elements[:3]] == [("position", a, "base") for a in "xyz"]
+    assert "".join(one.axis for one in elements[3:]) == order
+    assert {one.quantity for one in elements[3:]} == {"quaternion"}
+    assert {one.quantity for one in contract.action_space.elements} == {"joint velocity"}
+    assert any("--convention quaternion=wxyz or xyzw" in notice for notice in notices) == (order == "")

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import CheckpointError, UsageError
+from rlservo.errors import CheckpointError, UsageError
 from rlservo.export.export_checkpoint import export_checkpoint
 from rlservo.export.sources.registry import find_source, sources
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.policy.policy import Policy
 
 EXAMPLE = Path(__file__).resolve().parents[3] / "examples" / "linear_source.py"
 

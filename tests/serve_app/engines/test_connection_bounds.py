@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -43,6 +44,14 @@ def head(*lines: str, method: str = "POST", path: str = PATH) -> bytes:
     return "".join(f"{line}\r\n" for line in fields).encode() + b"\r\n"
 
 
+UPGRADE = head(
+    "upgrade: websocket",
+    "connection: upgrade",
+    "sec-websocket-version: 13",
+    "sec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==",
+    method="GET",
+    path="/v1/policies/ur5/stream",
+)
 WHOLE = head(f"content-length: {len(BODY)}") + BODY
 
 
@@ -146,6 +155,14 @@ def test_a_head_that_is_too_large_is_refused(server: Run, pieces: int) -> None:
     assert json.loads(body)["error"] == "the request's headers are larger than 16384 bytes"
 
 
+def test_a_complete_head_that_is_too_large_is_refused(server: Run) -> None:
+    sent = WHOLE.replace(b"host:", b"x: " + b"a" * 30_000 + b"\r\nhost:")
+    with contextlib.closing(connected(server.port, 20)) as connection:
+        connection.sendall(sent)
+        status, _, body = read_reply(connection)
+    assert status == 431 and json.loads(body)["error"] == "the request's headers are larger than 16384 bytes"
+
+
 def test_a_trailer_is_not_a_header(policies: Path, server: Run) -> None:
     """Neither a key, nor a host, nor a page's origin counts there; what came before the body does."""
     chunked = b"%x\r\n%s\r\n0\r\n" % (len(BODY), BODY)
@@ -161,15 +178,49 @@ def test_a_trailer_is_not_a_header(policies: Path, server: Run) -> None:
         assert status == 200, body
 
 
-def test_endless_trailers_end_the_connection(server: Run) -> None:
+ENDLESS = {"many lines": b"x: " + b"a" * 60000 + b"\r\n", "one line": b"a" * 60000}
+
+
+@pytest.mark.parametrize("piece", ENDLESS.values(), ids=ENDLESS)
+def test_endless_trailers_end_the_connection(server: Run, piece: bytes) -> None:
+    """At 16 KB, besides what is on its way: sockets of both sides and two reads take less than 8 MB."""
     before = memory_mb(server)
     with contextlib.closing(connected(server.port, 20)) as connection, others_are_answered(server):
-        connection.sendall(head("transfer-encoding: chunked") + b"%x\r\n%s\r\n0\r\n" % (len(BODY), BODY))
+        connection.sendall(head("transfer-encoding: chunked") + b"%x\r\n%s\r\n0\r\nx: " % (len(BODY), BODY))
         sent = 0
         with pytest.raises(OSError):
             while sent < 256 << 20:
-                sent += connection.send(b"x: " + b"a" * 60000 + b"\r\n")
+                sent += connection.send(piece)
+    assert sent < 8 << 20
     assert memory_mb(server) - before < 64
+
+
+def test_an_endless_trailer_is_refused_with_its_bound(server: Run) -> None:
+    """A body before them counts to neither bound, whether in one read or in many."""
+    large = b" " * 50_000 + BODY
+    chunked = head("transfer-encoding: chunked") + b"%x\r\n%s\r\n0\r\n" % (len(large), large)
+    with contextlib.closing(connected(server.port, 20)) as connection:
+        for start in range(0, len(chunked), 10_000):
+            connection.sendall(chunked[start : start + 10_000])
+            time.sleep(0.02)  # a read each
+        connection.sendall(b"x: " + b"a" * 15_000 + b"\r\n\r\n")
+        assert read_reply(connection)[0] == 200
+        connection.sendall(chunked + b"x: ")
+        for _ in range(17):
+            connection.sendall(b"a" * 1000)
+            time.sleep(0.02)
+        status, headers, body = read_reply(connection)
+    assert (status, headers["connection"]) == (400, "close")
+    assert json.loads(body)["error"] == "the request's trailers are larger than 16384 bytes"
+
+
+def test_a_head_after_a_large_body_in_one_read_is_not_too_large(server: Run) -> None:
+    large = b" " * 50_000 + BODY
+    with contextlib.closing(connected(server.port, 20)) as connection:
+        connection.sendall(head(f"content-length: {len(large)}") + large + WHOLE[:20])
+        assert read_reply(connection)[0] == 200
+        connection.sendall(WHOLE[20:])
+        assert read_reply(connection)[0] == 200
 
 
 def test_pipelined_requests_that_no_one_reads_take_bounded_memory(server: Run) -> None:
@@ -288,6 +339,35 @@ def test_connections_of_one_address_are_bounded(server: Run) -> None:
         time.sleep(0.1)
 
 
+def test_connections_that_ended_do_not_count_and_other_addresses_do_not_either(server: Run) -> None:
+    """Ended as HTTP or as a WebSocket, by either side, and also while the connection is upgraded."""
+    for sent in (b"", WHOLE, b"\x16\x03", UPGRADE, UPGRADE + frame(0x8, b"")):
+        for _ in range(PER_ADDRESS):
+            with contextlib.closing(connected(server.port, 20)) as connection:
+                connection.sendall(sent)
+                if sent == UPGRADE:
+                    assert connection.recv(1000).startswith(b"HTTP/1.1 101")
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset
+    others = [
+        socket.create_connection(("127.0.0.1", server.port), 20, source_address=("127.0.0.2", 0))
+        for _ in range(PER_ADDRESS)
+    ]
+    try:
+        deadline = time.monotonic() + 10
+        while (answer := exchange(server, WHOLE))[0] != 200:
+            assert time.monotonic() < deadline, answer
+            time.sleep(0.1)
+        own = []
+        with contextlib.ExitStack() as stack:
+            for _ in range(PER_ADDRESS):
+                own.append(stack.enter_context(contextlib.closing(connected(server.port, 20))))
+            own[-1].sendall(WHOLE)
+            assert read_reply(own[-1])[0] == 200
+    finally:
+        for connection in others:
+            connection.close()
+
+
 def test_what_connections_are_refused_for_is_counted(server: Run) -> None:
     exchange(server, b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + os.urandom(8))
     _, text = exchange(server, head(method="GET", path="/metrics"))
@@ -303,17 +383,13 @@ def frame(opcode: int, payload: bytes, *, final: bool = True) -> bytes:
 @contextlib.contextmanager
 def web_socket(run: Run, **options: int) -> Iterator[socket.socket]:
     """Open a WebSocket; `options` are the TCP socket's."""
-    upgrade = ("upgrade: websocket", "connection: upgrade", "sec-websocket-version: 13")
-    opening = head(
-        *upgrade, "sec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==", method="GET", path="/v1/policies/ur5/stream"
-    )
     with socket.socket() as connection:
         for name, value in options.items():
             level = socket.IPPROTO_TCP if name.startswith("TCP_") else socket.SOL_SOCKET
             connection.setsockopt(level, getattr(socket, name), value)
         connection.settimeout(20)
         connection.connect(("127.0.0.1", run.port))
-        connection.sendall(opening)
+        connection.sendall(UPGRADE)
         received = b""
         while b"\r\n\r\n" not in received:
             received += connection.recv(65536)

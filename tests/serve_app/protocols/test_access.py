@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 
 import pytest
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.pages import FOLDER, SWAGGER_FILES
 from rlservo.serve_app.protocols.routes import WEBSOCKET

@@ -19,9 +19,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from rlservo.client.admin_client import AdminClient, find_key
+from rlservo.client.formats.admin_key_file import key_file, read_key, written_key
 from rlservo.deploy.cli import app as command_line
 from rlservo.deploy.commands.serve import served_config
-from rlservo.export.contract.errors import (
+from rlservo.errors import (
     ConflictError,
     ForbiddenError,
     RefusedError,
@@ -30,15 +32,13 @@ from rlservo.export.contract.errors import (
     UnknownVersionError,
     UsageError,
 )
-from rlservo.serve_app.client.admin_client import AdminClient, find_key
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.repository.repository import Repository
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from rlservo.serve_app.wire.admin_key_file import key_file, read_key, written_key
 from servers import exchange
 from stores import plan_files
 
@@ -127,6 +127,8 @@ def test_the_listing_says_what_runs_since_when_and_how_much(port: int, admin: Ad
     assert one["loaded_at"].startswith("20") and one["loaded_at"].endswith("+00:00")
     _, whole = ask(port, "GET", "/v1/policies")
     assert (whole["replica"], whole["generation"], whole["changed_by"]) == ("only", 2, "alias ur5 production=2")
+    recent = [(each["generation"], each["changed_by"]) for each in whole["recent"]]
+    assert recent == [(2, "alias ur5 production=2"), (1, "configuration")]
     assert admin.listing() == whole
 
 
@@ -329,8 +331,9 @@ def test_the_command_line_does_all_of_it(port: int, key_path: Path) -> None:
 
 
 def test_the_operators_key_is_for_this_user_alone_and_goes_with_the_server(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    server = f"http://127.0.0.1:{port}"
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.delenv("RLSERVO_ADMIN_KEY", raising=False)
     file = key_file(8000)
@@ -340,10 +343,10 @@ def test_the_operators_key_is_for_this_user_alone_and_goes_with_the_server(
         assert is_written and not file.is_symlink() and stat.S_IMODE(file.stat().st_mode) == 0o600
         assert find_key("http://127.0.0.1:8000", None) == read_key(file) == "abcdef"
         with pytest.raises(UsageError, match="needs an admin key"):
-            find_key("http://robot:8000", None)
+            find_key(server, None)
     assert not file.exists() and not (tmp_path / "elsewhere").exists()
     with pytest.raises(UsageError, match="needs an admin key"):
-        find_key("http://127.0.0.1:8000", None)
+        find_key(server, None)
     monkeypatch.setenv("RLSERVO_ADMIN_KEY", "abc")
     assert find_key("http://robot:8000", None) == "abc"
 

@@ -18,19 +18,19 @@ import websockets.sync.client
 from onnx import TensorProto, helper
 
 from bundles import PARITY, PROVENANCE, save_graph, write_bundle
-from rlservo.export.contract import bundle as bundle_files
-from rlservo.export.contract.contract import BakedStep, Contract, TensorSpec
-from rlservo.export.contract.errors import ObservationError, RequestError
-from rlservo.export.contract.spaces import BoxSpec
-from rlservo.serve_app.episodes.request import Request
+from rlservo.bundle import bundle as bundle_files
+from rlservo.bundle.contract import BakedStep, Contract, TensorSpec
+from rlservo.bundle.spaces import BoxSpec
+from rlservo.errors import ObservationError, RequestError
+from rlservo.policy.input_numbers import parse_array
+from rlservo.policy.observation_check import ObservationParser
+from rlservo.policy.options import PolicyOptions
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import FIELDS, OipGrpcCodec
-from rlservo.serve_app.protocols.open_inference.messages import messages
-from rlservo.serve_app.runtime.input_numbers import parse_array
-from rlservo.serve_app.runtime.observation_check import ObservationParser
-from rlservo.serve_app.runtime.options import PolicyOptions
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.sessions.request import Request
 from stores import control_of, load_store
 
 TYPES = {"int64": TensorProto.INT64, "uint64": TensorProto.UINT64, "uint8": TensorProto.UINT8}
@@ -141,6 +141,17 @@ def test_an_integer_that_fits_is_acted_on_exactly(http: httpx.Client, policy: st
     assert status == 200 and reply["outputs"][0]["data"] == digits(number), reply
     status, reply = post(http, f"/v1/policies/{policy}/act", f'{{"obs": [{number}, 1]}}')
     assert status == 200 and reply["action"] == digits(number), reply
+
+
+@pytest.mark.parametrize("policy", TYPES)
+def test_flags_alone_are_0_and_1_for_every_integer_dtype(http: httpx.Client, app: PolicyApp, policy: str) -> None:
+    for obs, expected in (([True, False], [1, 0]), ([[False, True], [True, True]], [[0, 1], [1, 1]])):
+        status, reply = post(http, f"/v1/policies/{policy}/act", json.dumps({"obs": obs}))
+        assert (status, reply.get("action")) == (200, expected), reply
+    flags = '{"inputs": [{"name": "obs", "shape": [1, 2], "datatype": "BOOL", "data": [true, false]}]}'
+    status, reply = post(http, f"/v2/models/{policy}/infer", flags)
+    assert status == 200 and reply["outputs"][0]["data"] == [1, 0], reply
+    assert app.handler.store().get(policy).act(np.array([True, False])).tolist() == [1, 0]
 
 
 @pytest.mark.parametrize(("policy", "number", "datatype"), REFUSED)

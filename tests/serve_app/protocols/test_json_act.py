@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.contract import Contract
+from rlservo.bundle.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from servers import over_uvicorn
 from stores import control_of, load_store
 

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlservo.policy.options import PolicyOptions
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
-from rlservo.serve_app.protocols.open_inference.messages import messages
 from rlservo.serve_app.protocols.open_inference.model_info import METHODS, statistics
-from rlservo.serve_app.runtime.options import PolicyOptions
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.versions.serving_plan import PolicyPlan
+from rlservo.serve_app.versions.deployment_plan import PolicyPlan
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from servers import exchange
 from stores import control_of, load_store
 

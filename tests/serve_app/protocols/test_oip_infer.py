@@ -19,7 +19,7 @@ import pytest
 
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from stores import control_of, load_store
 
 LENGTH = "Inference-Header-Content-Length"
@@ -201,10 +201,10 @@ def test_an_empty_tensor_that_numpy_cannot_make_is_refused(ask: Ask, more: dict[
 
 
 def test_over_grpc_it_is_refused_too(store: PolicyStore) -> None:
-    from rlservo.export.contract.errors import RequestError
-    from rlservo.serve_app.episodes.request import Request
+    from rlservo.errors import RequestError
     from rlservo.serve_app.protocols.open_inference.grpc_service import OipGrpcCodec
-    from rlservo.serve_app.protocols.open_inference.messages import messages
+    from rlservo.serve_app.protocols.open_inference.oip_messages import messages
+    from rlservo.serve_app.sessions.request import Request
 
     handler = create_app(control_of(store), ServerSettings()).handler
     for raw in ([b""], []):

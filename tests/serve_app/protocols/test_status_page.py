@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from browser import Browser, Tab
-from rlservo.export.contract.bundle import read_contract, write_contract
-from rlservo.export.contract.contract import BakedStep
-from rlservo.export.contract.spaces import BoxSpec, Element
-from rlservo.serve_app.client.admin_client import AdminClient
+from rlservo.bundle.bundle import read_contract, write_contract
+from rlservo.bundle.contract import BakedStep
+from rlservo.bundle.spaces import BoxSpec, Element
+from rlservo.client.admin_client import AdminClient
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.pages import FOLDER
 from rlservo.serve_app.server.api_keys import new_key
@@ -38,7 +39,8 @@ PAGE = {"accept": CHROMIUM}
 OPERATOR, OPERATOR_LINE = new_key("operator", admin=True)
 ROBOT, ROBOT_LINE = new_key("cell-7")
 FIRST = {"policies": {"ur5": {"aliases": {"production": "1"}}}}  # which version is in use
-CONTRACT_BUTTON = "document.querySelector('#policy-ur5').parentElement.querySelector('tbody button')"
+POLICY = "document.querySelector('#policy-ur5').parentElement"
+CONTRACT_BUTTON = f"{POLICY}.querySelector('tbody button')"
 MARKUP = "<img src=x onerror='window.broken=1'><script>window.broken=1</script>&amp;"
 ROUND_MS = 250  # between two of the page's looks, instead of two seconds
 # Where pictures for the documents go, if they are wanted: CONTRIBUTING.md has the command.
@@ -181,10 +183,30 @@ def picture(tab: Tab, name: str, folder: Path) -> None:
     tab.save_picture(Path(PICTURES or folder) / f"{name}.png")
 
 
+def chart(tab: Tab, title: str) -> dict[str, Any]:
+    """Return ur5's chart of this title: its levels' heights, its ticks' places and its curves' points."""
+    texts = "[...svg.querySelectorAll(kind)].map(node => [node.textContent, node.getAttribute(at)])"
+    found = tab.evaluate(
+        f"(() => {{ const named = figure => figure.querySelector('strong').textContent === {title!r};"
+        f"const svg = [...{POLICY}.querySelectorAll('figure')].find(named).querySelector('svg');"
+        f"const texts = (kind, at) => {texts};"
+        "const lines = [...svg.querySelectorAll('.grid')].map(line => line.getAttribute('d').match(/,([^H]*)/)[1]);"
+        "return {levels: texts('.level', 'y'), lines, ticks: texts('text:not(.level)', 'x'),"
+        " curves: [...svg.querySelectorAll('.curve')].map(curve => curve.getAttribute('d'))} })()"
+    )
+    assert [height for _, height in found["levels"]] == found["lines"]
+    points = [re.findall(r"([\d.]+),([\d.]+)", path) for path in found["curves"]]
+    return {
+        "levels": {float(text): float(height) for text, height in found["levels"]},
+        "ticks": {text: float(place) for text, place in found["ticks"]},
+        "curves": [[(float(x), float(y)) for x, y in curve] for curve in points],
+    }
+
+
 def row(version: str) -> str:
     """Return the expression of a version's cells, by their headings."""
     return (
-        "(() => { const table = document.querySelector('#policy-ur5').parentElement.querySelector('table');"
+        f"(() => {{ const table = {POLICY}.querySelector('table');"
         "const names = [...table.querySelectorAll('thead th')].map(cell => cell.textContent);"
         f"const line = [...table.tBodies[0].rows].find(line => line.cells[0].textContent === '{version}');"
         "return Object.fromEntries(names.map((name, index) => [name, line.cells[index].textContent])); })()"
@@ -225,6 +247,10 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
     assert cells["Aliases"] == "production" and re.fullmatch(r"[\d.]+ / [\d.]+ ms", cells["Latency p50 / p99"])
     assert tab.evaluate("document.activeElement.getAttribute('aria-label')") == "Contract of ur5, version 1"
     assert tab.evaluate("document.title") == "rlservo: 2 policies"
+    for _ in range(150 if PICTURES else 0):  # curves take their time
+        server.act(3)
+        tab.evaluate(f"new Promise(resolve => setTimeout(resolve, {ROUND_MS}))")
+    tab.evaluate("scrollTo(0, 0)")
     picture(tab, "status_page", tmp_path)
     assert tab.complaints == []
 
@@ -237,18 +263,58 @@ def test_the_page_shows_what_runs_and_sees_a_switch_of_versions(tab: Tab, server
         assert before.ended is not None and before.ended <= after.began, (before, after)
     assert not [request for request in tab.requests.values() if request.headers.get("Referer")]
 
+    # The changes from before the page was opened.
+    tab.visit(server.url)
+    tab.wait_for_text("plan 1, configuration", ", alias ur5 production=2")
+
 
 def test_the_page_shows_how_each_version_succeeds(tab: Tab, server: Served) -> None:
     tab.visit(server.url)
     tab.wait_for_text("Versions of ur5")
-    assert tab.evaluate("[...document.querySelectorAll('.rates')].filter(part => part.hidden).length") == 2
+    curves = f"{POLICY}.querySelectorAll('.curve').length"
+    assert "by version" not in tab.text() and tab.evaluate(curves) == 0  # an empty chart has words, not axes
     for version, endings in (("1", ["collision"] * 3 + ["success"]), ("2", ["success"] * 4)):
         for status in endings:
             end = {"obs": [0.0] * 27, "final_status": status}
             assert httpx.post(f"{server.url}/v1/policies/ur5/versions/{version}/act", json=end).status_code == 200
     tab.wait_for_text("Episodes that succeeded, by version: 25% of 4 with 1, … 100% of 4 with 2")
-    curves = "document.querySelector('#policy-ur5').parentElement.querySelectorAll('.rates polyline')"
-    assert tab.evaluate(f"{curves}[1].getAttribute('points')") == "0.0,26.5 240.0,1.0"
+    drawn = chart(tab, "Success by version [%]")
+    assert drawn["levels"] == {0.0: 120.0, 50.0: 64.0, 100.0: 8.0} and list(drawn["ticks"]) == ["1", "2"]
+    (success,) = drawn["curves"]
+    assert [y for _, y in success] == [92.0, 8.0]  # 25% and 100%
+    assert [x for x, _ in success] == pytest.approx(list(drawn["ticks"].values()), abs=0.1)
+
+
+def test_the_page_draws_requests_and_latency_over_time(tab: Tab, server: Served) -> None:
+    tab.visit(server.url)
+    tab.wait_for_text("Versions of ur5", "No requests yet: their rate")
+    for _ in range(3):
+        server.act(5)
+        tab.evaluate(f"new Promise(resolve => setTimeout(resolve, {ROUND_MS}))")
+    counted = "[...document.querySelectorAll('.curve')].every(curve => curve.getAttribute('d').includes('L'))"
+    tab.wait_for(f"document.querySelector('.curve') && {counted}")
+    assert tab.evaluate("document.querySelector('.facts').textContent").startswith("In useversion 1")
+
+    drawn = chart(tab, "Latency [ms]")
+    levels = sorted(drawn["levels"])
+    assert len(levels) >= 2 and all(b == pytest.approx(10 * a) for a, b in itertools.pairwise(levels)), levels
+    heights = [drawn["levels"][level] for level in levels]
+    assert heights == sorted(heights, reverse=True) and (heights[0], heights[-1]) == (120.0, 8.0)
+    # What the curves end at is what the versions' table says: the one version that answered, in the same look.
+    shown = tab.evaluate(f"({row('1')})['Latency p50 / p99']")
+    decades = np.interp([curve[-1][1] for curve in drawn["curves"]], heights[::-1], np.log10(levels)[::-1])
+    assert 10**decades == pytest.approx([float(part) for part in shown.removesuffix(" ms").split(" / ")], rel=0.1)
+    median, high = drawn["curves"]
+    assert all(below[1] >= above[1] for below, above in zip(median, high, strict=True))  # y grows downwards
+    # Times are local, and where the axis says.
+    assert len(drawn["ticks"]) >= 3 and all(re.fullmatch(r"\d\d:\d\d:\d\d", text) for text in drawn["ticks"])
+    seconds = [int(text[-2:]) for text in drawn["ticks"]]
+    assert all((b - a) % 60 == 15 for a, b in itertools.pairwise(seconds))
+    rates = chart(tab, "Requests [1/s]")
+    assert rates["levels"][0.0] == 120.0 and rates["levels"][max(rates["levels"])] == 8.0
+    answered, failed = rates["curves"]
+    assert {y for _, y in failed} == {120.0} and answered[-1][1] < 120.0 and len(answered) == len(failed)
+    assert tab.complaints == []
 
 
 def test_what_a_policy_says_of_itself_is_text(
@@ -399,10 +465,14 @@ def test_a_small_screen_and_a_keyboard_are_enough(tab: Tab, server: Served, tmp_
     tab.press("Enter")
     tab.wait_for_text("Contract of ur5, version 2", "Action, ready for the environment's step")
     assert tab.evaluate("document.activeElement.getAttribute('aria-expanded')") == "true"
-    # Wide tables scroll within themselves; the page does not.
+    # Nothing is cut: neither the page nor a table is wider than the screen, and each value has its column's name.
     assert tab.evaluate("document.documentElement.scrollWidth") <= 390
     widths = "[...document.querySelectorAll('.scroll')].map(region => [region.clientWidth, region.scrollWidth])"
-    assert [inner > outer for outer, inner in tab.evaluate(widths)].count(True) >= 2
+    assert len(tab.evaluate(widths)) >= 4 and all(inner <= outer for outer, inner in tab.evaluate(widths))
+    edges = "[...document.querySelectorAll('td, text, dd')].map(node => node.getBoundingClientRect().right)"
+    assert max(tab.evaluate(edges)) <= 390
+    named = "[...document.querySelectorAll('td')].map(cell => getComputedStyle(cell, '::before').content)"
+    assert {'"Share"', '"Drift"', '"Shift now [σ]"'} <= set(tab.evaluate(named))
     assert tab.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 24, 29)"
     unnamed = "[...document.querySelectorAll('table')].filter(table => !table.caption?.textContent)"
     unscoped = "[...document.querySelectorAll('th')].filter(cell => !['row', 'col'].includes(cell.scope))"

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from uvicorn.protocols.utils import ClientDisconnected
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from rlservo.export.contract.contract import Contract
+from rlservo.bundle.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.metrics import exposition
+from rlservo.serve_app.server.exposition import exposition
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from stores import control_of, load_store
 
 OBS = (np.arange(27) * 0.01).astype(np.float32)

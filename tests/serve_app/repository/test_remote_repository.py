@@ -24,8 +24,8 @@ from typing import Any
 import pytest
 
 from bundles import write_box_policy
-from rlservo.export.contract.bundle import load_bundle
-from rlservo.export.contract.errors import (
+from rlservo.bundle.bundle import load_bundle
+from rlservo.errors import (
     BundleError,
     ConflictError,
     RefusedError,
@@ -34,20 +34,20 @@ from rlservo.export.contract.errors import (
     UnknownPolicyError,
     UsageError,
 )
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.engines.server_process import repeat
 from rlservo.serve_app.repository.index import INDEX, Index
 from rlservo.serve_app.repository.object_storage import ObjectStorage
+from rlservo.serve_app.repository.places import place_of
 from rlservo.serve_app.repository.publication import next_version, publish
 from rlservo.serve_app.repository.repository import Repository
-from rlservo.serve_app.repository.storage import place_of
-from rlservo.serve_app.runtime.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
+from rlservo.serve_app.versions.deployment_plan import Plan, ServedConfig
 from rlservo.serve_app.versions.plan_commands import Load, SetAlias, Unload
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.serving_plan import Plan, ServedConfig
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from storages import ENDLESS, MOST_SENT, SECRET, Cut, Drip, Lie, Storage, late, only
 from waiting import until
@@ -513,10 +513,12 @@ def test_wrong_and_missing_credentials_are_said(
         "file://host/p",
         "gs://bucket/p",
         "s3:///p",
+        "hf://hunter2@owner/name",
+        "hf://owner/name?token=hunter2",
     ],
 )
 def test_uris_with_secrets_or_of_other_protocols_are_refused_without_showing_them(uri: str) -> None:
-    with pytest.raises(UsageError, match="expected s3://bucket/policies, https://host/policies or") as caught:
+    with pytest.raises(UsageError, match="expected s3://bucket/policies, hf://owner/name") as caught:
         Repository([uri])
     assert "hunter2" not in caught.value.message
     with pytest.raises(UsageError, match="credentials come from the environment"):

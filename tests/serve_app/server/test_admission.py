@@ -7,14 +7,15 @@ import time
 
 import pytest
 
-from rlservo.export.contract.errors import LateError
-from rlservo.serve_app.server.admission import SETTLE_S
-from rlservo.serve_app.server.request_handler import Admission
+from rlservo.errors import LateError
+from rlservo.serve_app.server.load_shedding import SETTLE_S, LoadShedding
 from rlservo.serve_app.server.settings import ServerSettings
 
 
-def admission_of(max_queue_ms: float) -> Admission:
-    return Admission(ServerSettings(max_ongoing_requests=8, max_queue_ms=max_queue_ms, max_incoming=8, max_streams=8))
+def admission_of(max_queue_ms: float) -> LoadShedding:
+    return LoadShedding(
+        ServerSettings(max_ongoing_requests=8, max_queue_ms=max_queue_ms, max_incoming=8, max_streams=8)
+    )
 
 
 def test_what_is_read_after_a_loop_stood_still_is_refused_and_what_comes_later_is_not() -> None:

@@ -15,14 +15,14 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import InvalidStatus
 
-from rlservo.export.contract.errors import ForbiddenError, RequestError, UsageError
+from rlservo.client.formats.addresses import is_loopback
+from rlservo.errors import ForbiddenError, RequestError, UsageError
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.access_checks import OriginChecks, fold_headers
 from rlservo.serve_app.server.api_keys import Keys, Role, check_exposure, new_key
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.policy_store import PolicyStore
-from rlservo.serve_app.wire.addresses import is_loopback
 from servers import exchange
 from stores import control_of, load_store
 

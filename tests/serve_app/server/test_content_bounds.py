@@ -17,17 +17,17 @@ import orjson
 import pytest
 import websockets.sync.client
 
-from rlservo.export.contract.bundle import read_contract
-from rlservo.export.contract.contract import Contract
-from rlservo.export.contract.errors import TooLargeError
-from rlservo.export.contract.spaces import BoxSpec, DictSpec, DiscreteSpec, Element, TupleSpec
-from rlservo.serve_app.episodes.request import Request
+from rlservo.bundle.bundle import read_contract
+from rlservo.bundle.contract import Contract
+from rlservo.bundle.spaces import BoxSpec, DictSpec, DiscreteSpec, Element, TupleSpec
+from rlservo.client.formats.msgpack_arrays import pack, unpack
+from rlservo.errors import TooLargeError
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import OipGrpcCodec
-from rlservo.serve_app.protocols.open_inference.messages import messages
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.content_bounds import ContentBounds
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.wire.msgpack_arrays import pack, unpack
+from rlservo.serve_app.sessions.request import Request
 from stores import control_of, load_store
 
 ROWS = 64
@@ -96,19 +96,46 @@ def test_a_frame_of_more_than_a_batch_needs_is_not_unpacked(http: httpx.Client, 
         assert json.loads(stream.recv())["code"] == "too-large"
 
 
-def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: PolicyApp) -> None:
-    many = messages.ModelInferRequest(model_name="ur5")
-    for number in range(20_000):
-        many.inputs.add(name=f"i{number}")
-    named = messages.ModelInferRequest(model_name="ur5")
-    for number in range(20_000):
-        named.parameters[f"p{number}"].bool_param = True
-    long = messages.ModelInferRequest(model_name="ur5", id="x" * 1_000_000)
-    for message in (many, named, long):
-        request = Request("grpc", "", None, time.perf_counter())
-        handler = app.handler
-        with pytest.raises(TooLargeError):
-            asyncio.run(handler.answer(OipGrpcCodec(), request, message.SerializeToString()))
+def parameters(place: Any, count: int) -> None:
+    for number in range(count):
+        place.parameters[f"p{number}"].bool_param = True
+
+
+def grpc_message(name: str) -> Any:
+    message = messages.ModelInferRequest(model_name="ur5", id="x" * 1_000_000 if name == "a long text" else "")
+    if name == "inputs":
+        for number in range(5000):
+            message.inputs.add(name=f"i{number}")
+    elif name == "parameters":
+        parameters(message, 5000)
+    elif name == "parameters of tensors":
+        for number in range(10):
+            parameters(message.inputs.add(name=f"i{number}"), 500)
+    elif name == "parameters of outputs":
+        parameters(message.outputs.add(name="action"), 5000)
+    elif name == "sizes":
+        message.inputs.add(name="obs", datatype="FP32", shape=[1] * 100_000)
+    elif name == "numbers":
+        message.inputs.add(name="obs", datatype="BOOL", shape=[100_000]).contents.bool_contents.extend([True] * 100_000)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("inputs", "1000 inputs"),
+        ("parameters", "1000 parameters"),
+        ("parameters of tensors", "1000 parameters"),
+        ("parameters of outputs", "1000 parameters"),
+        ("sizes", "1000 sizes"),
+        ("numbers", r"\d+ numbers"),
+        ("a long text", r"\d+ bytes"),
+    ],
+)
+def test_a_grpc_message_of_more_than_a_batch_needs_is_refused(app: PolicyApp, name: str, what: str) -> None:
+    request = Request("grpc", "", None, time.perf_counter())
+    with pytest.raises(TooLargeError, match=f"more than {what}"):
+        asyncio.run(app.handler.answer(OipGrpcCodec(), request, grpc_message(name).SerializeToString()))
 
 
 IMAGE = BoxSpec(shape=(20, 20, 4), dtype="uint8", low=0, high=255)

@@ -16,7 +16,7 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 from rlservo.serve_app.server import current_keys
 from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.current_keys import CurrentKeys

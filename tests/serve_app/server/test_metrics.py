@@ -13,7 +13,8 @@ import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.metrics import Metrics, exposition
+from rlservo.serve_app.server.exposition import exposition
+from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import Load, Unload

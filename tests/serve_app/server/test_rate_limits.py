@@ -17,17 +17,17 @@ import websockets.sync.client
 from typer.testing import CliRunner
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from rlservo.client.policy_client import PolicyClient
+from rlservo.client.stream_client import StreamClient
 from rlservo.deploy.cli import app as command_line
-from rlservo.export.contract.errors import RateLimitError, UsageError
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.errors import RateLimitError, UsageError
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
-from rlservo.serve_app.protocols.open_inference.messages import messages
+from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, Role, new_key
 from rlservo.serve_app.server.current_keys import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.policy_store import PolicyStore
+from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from servers import exchange
 from stores import control_of, load_store
 

@@ -18,10 +18,10 @@ import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
-from rlservo.export.contract.errors import OverloadedError
+from rlservo.errors import OverloadedError
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.server.request_handler import Admission
+from rlservo.serve_app.server.load_shedding import LoadShedding
 from rlservo.serve_app.server.settings import ServerSettings
 from stores import control_of, load_store
 
@@ -145,7 +145,9 @@ def test_a_silent_stream_is_closed_and_a_busy_one_is_not(serve: Serve) -> None:
 
 def test_a_wait_in_the_queue_counts_from_the_beginning_of_the_burst() -> None:
     async def burst() -> None:
-        admission = Admission(ServerSettings(max_ongoing_requests=10, max_queue_ms=50, max_incoming=1, max_streams=1))
+        admission = LoadShedding(
+            ServerSettings(max_ongoing_requests=10, max_queue_ms=50, max_incoming=1, max_streams=1)
+        )
         first = admission.enter()
         time.sleep(0.01)
         assert admission.enter() == first

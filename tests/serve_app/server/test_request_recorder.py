@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import UsageError
-from rlservo.export.contract.spaces import DiscreteSpec
-from rlservo.serve_app.client.policy_client import PolicyClient
-from rlservo.serve_app.client.stream_client import StreamClient
+from rlservo.bundle.spaces import DiscreteSpec
+from rlservo.client.policy_client import PolicyClient
+from rlservo.client.stream_client import StreamClient
+from rlservo.errors import UsageError
+from rlservo.policy.options import PolicyOptions
+from rlservo.recording.episodes import RecordedEpisode, episodes
+from rlservo.recording.reader import Recording
+from rlservo.recording.replay.replay import replay
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.recording.episodes import Episode, episodes
-from rlservo.serve_app.recording.reader import Recording
-from rlservo.serve_app.replay.replay import replay
-from rlservo.serve_app.runtime.options import PolicyOptions
 from rlservo.serve_app.server import request_recorder
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.request_handler import RequestHandler
@@ -55,7 +55,7 @@ class Server:
     def act(self, policy: str, body: Any, **headers: str) -> tuple[int, Any]:
         return self.post(f"/v1/policies/{policy}/act", body, **headers)
 
-    def recorded(self) -> list[Episode]:
+    def recorded(self) -> list[RecordedEpisode]:
         """End the recording and return its episodes."""
         self.recorder.close()
         return list(episodes(Recording(self.folder)))

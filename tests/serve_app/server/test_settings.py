@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rlservo.export.contract.errors import UsageError
+from rlservo.errors import UsageError
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 

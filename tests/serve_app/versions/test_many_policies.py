@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rlservo.export.contract.bundle import read_contract
+from rlservo.bundle.bundle import read_contract
 from rlservo.serve_app.repository import repository
 from stores import load_store
 

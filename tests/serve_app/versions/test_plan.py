@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
-from rlservo.export.contract.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
+from rlservo.errors import ConflictError, UnknownPolicyError, UnknownVersionError, UsageError
 from rlservo.serve_app.repository.repository import Listing
+from rlservo.serve_app.versions.deployment_plan import Plan, PolicyPlan, ServedConfig
 from rlservo.serve_app.versions.plan_commands import (
     Load,
     Rollback,
@@ -17,7 +18,6 @@ from rlservo.serve_app.versions.plan_commands import (
     agrees,
     first_policies,
 )
-from rlservo.serve_app.versions.serving_plan import Plan, PolicyPlan, ServedConfig
 
 AVAILABLE = {("ur5", "1"): "a", ("ur5", "2"): "b", ("ur5", "10"): "c", ("mir", "1"): "d"}
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import (
+from rlservo.errors import (
     BundleError,
     ConflictError,
     RefusedError,
@@ -23,13 +23,13 @@ from rlservo.export.contract.errors import (
     UnavailableError,
     UsageError,
 )
+from rlservo.policy.policy import Policy
 from rlservo.serve_app.engines.server_process import repeat
 from rlservo.serve_app.repository.repository import Repository
-from rlservo.serve_app.runtime.policy import Policy
+from rlservo.serve_app.versions.deployment_plan import Plan
 from rlservo.serve_app.versions.plan_commands import Load, Rollback, SetAlias, SetCanary, SetShadow, Unload
 from rlservo.serve_app.versions.plan_files import FOLDER, PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
-from rlservo.serve_app.versions.serving_plan import Plan
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from waiting import until
 
@@ -287,17 +287,16 @@ def test_a_configuration_begins_a_plan_and_commands_rule_after(
 
 
 def test_a_version_exported_since_is_not_in_use_by_itself_and_a_start_says_so(
-    folder: Path, box_policy: Callable[..., Path], caplog: pytest.LogCaptureFixture
+    folder: Path, box_policy: Callable[..., Path]
 ) -> None:
     async def run() -> None:
         await Fleet(folder, folder).deploy({})
         box_policy(folder, version="11", seed=11)
         fleet = Fleet(folder, folder)
         await fleet.deploy({})
-        poll = asyncio.create_task(fleet.controls[0].warn_of_newer())
-        await until(lambda: "newer than the versions of plan 1, and not loaded: ur5 11" in caplog.text)
-        assert fleet.defaults() == ["10"]
-        poll.cancel()
+        said = await fleet.controls[0].look()
+        assert said == {"ur5 version 11 is not served: the plan is older (rlservo policy load ur5 11)"}
+        assert fleet.defaults() == ["10"] and fleet.controls[0].not_loaded() == {"ur5": ["11"]}
 
     asyncio.run(run())
 
@@ -485,6 +484,67 @@ def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
         shutil.move(tmp_path / "away", tmp_path / FOLDER)
         await control.give(aliasing("1", "candidate"), "ur5")
         poll.cancel()
+
+    asyncio.run(run())
+
+
+STRANGE = {
+    "000000002.json": "000000002.json holds plan 1, so it is a copy",
+    "000000007.json": "000000007.json does not follow plan 1",
+    "999999999.json": "999999999.json does not follow plan 1",
+    "0000000002.json": "0000000002.json is not the file of a plan",
+    "٠٠٠٠٠٠٠٠٢.json": "٠٠٠٠٠٠٠٠٢.json is not the file of a plan",
+    "000000001 (copy).json": "000000001 \\(copy\\).json is not the file of a plan",
+}
+
+
+@pytest.mark.parametrize("name", STRANGE)
+def test_a_file_among_the_plans_that_is_not_ours_is_named_and_nothing_is_lost(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder)
+        await fleet.deploy(config("1", "2", production="1"))
+        (control,) = fleet.controls
+        first, strange = tmp_path / FOLDER / "000000001.json", tmp_path / FOLDER / name
+        number = name.removesuffix(".json") if name[:9] in ("000000007", "999999999") else "1"
+        strange.write_text(first.read_text().replace('"generation": 1', f'"generation": {int(number)}'))
+        sentence = f"{STRANGE[name]}.*: move it away"
+        for action in (control.give(aliasing("2"), "ur5"), fleet.start(folder, "late").configure({})):
+            with pytest.raises(UnavailableError, match=sentence):
+                await action
+        assert fleet.defaults() == ["1"] and {file.name for file in first.parent.iterdir()} == {first.name, name}
+        strange.unlink()
+        (first.parent / "000000001.json~").write_text("an editor's")
+        await control.give(aliasing("2"), "ur5")
+        assert fleet.defaults() == ["2"] and fleet.numbers() == {2}
+
+    asyncio.run(run())
+
+
+def test_a_copied_plan_is_reported_by_those_who_follow_and_not_served(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder)
+        await fleet.deploy(config("1", "2", production="1"))
+        shutil.copy(tmp_path / FOLDER / "000000001.json", tmp_path / FOLDER / "000000002.json")
+        with pytest.raises(UnavailableError, match=r"000000002\.json holds plan 1, so it is a copy: move it away"):
+            await fleet.follow()
+        assert fleet.numbers() == {1}
+
+    asyncio.run(run())
+
+
+def test_older_plans_may_be_deleted(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        fleet = Fleet(tmp_path, folder)
+        await fleet.deploy(config("1", "2", production="1"))
+        (control,) = fleet.controls
+        for version in ("2", "1", "2"):
+            await control.give(aliasing(version), "ur5")
+        for number in (1, 2, 3):
+            (tmp_path / FOLDER / f"{number:09d}.json").unlink()
+        await control.give(aliasing("1"), "ur5")
+        assert fleet.numbers() == {5}
 
     asyncio.run(run())
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rlservo.export.contract.errors import (
+from rlservo.errors import (
     BundleError,
     ConflictError,
     UnknownPolicyError,
     UnknownVersionError,
     UsageError,
 )
-from rlservo.serve_app.runtime.policy import Policy
-from rlservo.serve_app.versions.policy_store import take_step
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.versions.loaded_versions import take_step
 from stores import load_store
 
 OBS = np.zeros(27, np.float32) + 0.1

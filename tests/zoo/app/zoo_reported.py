@@ -11,6 +11,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis import ValueFunctionAPI
 from ray.rllib.core.rl_module.torch import TorchRLModule
+from ray.rllib.env.multi_agent_env import MultiAgentEnv
 from torch import nn
 
 VECTOR = Box(-1.0, 1.0, (3,), np.float32)
@@ -30,6 +31,7 @@ OBSERVATIONS: dict[str, Any] = {
     "uint32": Box(0, 4_000_000_000, (3,), np.uint32),
     "image": Box(0.0, 1.0, (64, 64, 3), np.float32),
     "huge": Box(-LARGEST, LARGEST, (3,), np.float32),
+    "unsorted": Dict([("wheels", Box(-1.0, 1.0, (2,), np.float32)), ("arm", Box(-1.0, 1.0, (2,), np.float32))]),
 }  # fmt: skip
 ACTIONS: dict[str, Any] = {
     "box": Box(np.array([-1.0, 0.0], np.float32), np.array([3.0, 0.5], np.float32)),
@@ -89,6 +91,45 @@ class PartReader(TorchRLModule, ValueFunctionAPI):
 
     def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
         return self.values(self._read(batch)).squeeze(-1)
+
+
+class InOrder(TorchRLModule, ValueFunctionAPI):
+    """Reads the parts of a Dict in the order in which they come."""
+
+    def setup(self) -> None:
+        self.policy, self.values = nn.Linear(4, 4), nn.Linear(4, 1)
+
+    def _read(self, batch: dict[str, Any]) -> Any:
+        return torch.cat(list(batch[Columns.OBS].values()), dim=-1)
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        return {Columns.ACTION_DIST_INPUTS: self.policy(self._read(batch))}
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
+        return self.values(self._read(batch)).squeeze(-1)
+
+
+class OutOfOrder(MultiAgentEnv):
+    """One agent, to which the parts of its observation come in another order than in its space."""
+
+    def __init__(self, config: Any = None) -> None:
+        super().__init__()
+        self.agents = self.possible_agents = ["robot"]
+        self.space = Dict({"arm": Box(-1.0, 1.0, (2,), np.float32), "wheels": Box(-1.0, 1.0, (2,), np.float32)})
+        self.observation_spaces, self.action_spaces = {"robot": self.space}, {"robot": Discrete(4)}
+        self.time = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.time = 0
+        return self._observe(), {}
+
+    def step(self, action: Any) -> Any:
+        self.time += 1
+        return self._observe(), {"robot": 1.0}, {"__all__": self.time >= 20}, {"__all__": False}, {}
+
+    def _observe(self) -> dict[str, Any]:
+        drawn = self.space.sample()
+        return {"robot": {"wheels": drawn["wheels"], "arm": drawn["arm"]}}
 
 
 class Masked(TorchRLModule, ValueFunctionAPI):

@@ -1,1 +1,0 @@
-"""Arms behind the environments: the arm interface, and a real UR arm with limits, watchdog and state machine."""

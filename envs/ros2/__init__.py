@@ -1,1 +1,0 @@
-"""Robots behind ROS 2 or a rosbridge: links, message conversions, an arm, a mobile base, and simulators of both."""

@@ -1,1 +1,0 @@
-"""Policy bundle, its contract and the errors: shared by the exporter and everything that runs a policy."""

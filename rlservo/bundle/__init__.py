@@ -1,0 +1,1 @@
+"""Policy bundle and its contract: shared by the exporter and everything that runs a policy."""

@@ -1,0 +1,147 @@
+"""Latency of a real arm: from a command to the first measured motion, over small steps of one wrist."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rlservo.robots.arm_interface import ROS2, RobotError, Vector
+from rlservo.robots.arm_process import ArmProcess
+from rlservo.robots.ur.parameters import JOINTS
+
+JOINT = JOINTS.index("wrist_3")  # turns the tool in place: the only joint whose motion cannot hit anything
+STEP = 0.05  # [rad], back and forth
+STEP_S = 0.4  # [s], for it
+NOTICED = 0.02  # [rad/s], a sixth of the motion's speed
+FULL = 0.9  # speed scaling from which on the motion itself is timed
+TARGET_NOTICED = 1e-6  # [rad], of the controller's setpoint, which has no noise
+PAUSE_S = 0.5
+TIMEOUT_S = 2.0
+LOOK_S = 0.001
+AGAIN_S = 0.05  # [s], between two setpoints of the same motion
+
+
+@dataclass(frozen=True)
+class LatencyReport:
+    """Latencies in ms, over `steps` steps, with their meaning for a policy at `control_rate_hz`."""
+
+    steps: int
+    p50_ms: float
+    p95_ms: float
+    max_ms: float
+    jitter_ms: float  # p95 minus p5
+    state_period_ms: float  # between two states of the robot, median
+    noise: float  # [rad], standard deviation of a joint at rest
+    control_rate_hz: float
+    cycles: int
+
+    @property
+    def disturbance(self) -> str:
+        """Argument of `rlservo verify --disturb`: the worst latency in whole cycles, and a real sensor's noise."""
+        return f"latency={self.cycles},noise=real"
+
+
+def measure_latency(
+    arm: ArmProcess, *, steps: int = 20, control_rate_hz: float = 10.0, on_step: Callable[[int], None] = lambda _: None
+) -> LatencyReport:
+    """Move a wrist back and forth by 0.05 rad and time each start. Raises RobotError if nothing moves.
+
+    A reduced speed scaling stretches the arm's motions, its lag too. Then the start of the controller's setpoint is
+    timed, and half of the look-ahead time added, the lag at full scaling.
+    """
+    is_full = arm.scale >= FULL
+    if not is_full and arm.host.startswith(ROS2):
+        raise RobotError(f"the speed scaling is {arm.scale:.0%}: set the slider to 100% for this measurement")
+    lag_s = 0.0 if is_full else arm.limits.lookahead_s / 2.0
+    home = arm.arm_state().positions.copy()
+    latencies_s: list[float] = []
+    periods_s: list[float] = []
+    still: list[Vector] = []
+    for _ in range(3 * steps):
+        if len(latencies_s) == steps:
+            break
+        arm.hold()
+        target = _wait_for_rest(arm, is_full=is_full)
+        still.append(arm.arm_state().positions)
+        goal = home.copy()
+        is_near = abs(still[-1][JOINT] - home[JOINT]) < STEP / 2  # the last motion may have been slow, or cut short
+        goal[JOINT] = still[-1][JOINT] + (STEP if is_near else -STEP)
+        arm.blend_in(at_once=True)
+        began = time.monotonic()
+        arm.command(goal, STEP_S)
+        if moved_s := _first_motion(arm, goal, began, target, periods_s):
+            latencies_s.append(moved_s - began + lag_s)
+            on_step(len(latencies_s))
+        while time.monotonic() - began < STEP_S:
+            arm.command(goal, max(began + STEP_S - time.monotonic(), AGAIN_S))
+            time.sleep(AGAIN_S)
+    arm.go_to(home)
+    if len(latencies_s) < steps:
+        raise RobotError(
+            f"this computer missed the start of {2 * steps} motions of {STEP_S:g} s: end other work on it, and repeat"
+        )
+    p5, p50, p95 = (1e3 * float(value) for value in np.percentile(latencies_s, (5, 50, 95)))
+    worst = 1e3 * max(latencies_s)
+    return LatencyReport(
+        steps=steps,
+        p50_ms=p50,
+        p95_ms=p95,
+        max_ms=worst,
+        jitter_ms=p95 - p5,
+        state_period_ms=1e3 * float(np.median(periods_s)) if periods_s else math.nan,
+        noise=float(np.std([one[:JOINT] for one in still], axis=0).max()),
+        control_rate_hz=control_rate_hz,
+        cycles=max(1, math.ceil(worst / 1e3 * control_rate_hz)),
+    )
+
+
+def _wait_for_rest(arm: ArmProcess, *, is_full: bool) -> Vector | None:
+    """Wait until the arm has been at rest for a while; return the controller's setpoint where that will be timed."""
+    began = rests_s = time.monotonic()
+    target, patience_s = None if is_full else arm.target(), PAUSE_S + TIMEOUT_S / max(arm.scale, 0.01)
+    while time.monotonic() - rests_s < PAUSE_S or np.abs(arm.arm_state().velocities).max() > NOTICED / 2:
+        _check_fault(arm)
+        if target is not None and np.abs(arm.target() - target).max() > TARGET_NOTICED / 2:
+            target, rests_s = arm.target(), time.monotonic()
+        if time.monotonic() - began > patience_s:
+            raise RobotError(f"the robot does not come to rest within {patience_s:.3g} s")
+        time.sleep(LOOK_S)
+    return target
+
+
+def _first_motion(
+    arm: ArmProcess, goal: Vector, began: float, target: Vector | None, periods_s: list[float]
+) -> float | None:
+    """Return the arrival time of the first state with motion [s of time.monotonic]; None if it was missed.
+
+    With `target` it is that of the controller's setpoint, away from there [rad] (6,).
+    """
+    before, given = arm.arm_state(), began
+    while time.monotonic() - began < TIMEOUT_S:
+        state = arm.arm_state()
+        if state.time_s != before.time_s:
+            periods_s.append(state.time_s - before.time_s)
+            before = state
+        if target is None:
+            has_moved = abs(state.velocities[JOINT]) > NOTICED
+        else:
+            has_moved = abs(arm.target()[JOINT] - target[JOINT]) > TARGET_NOTICED
+        if has_moved:
+            return state.received_s
+        if abs(state.positions[JOINT] - goal[JOINT]) < STEP / 4:
+            return None
+        _check_fault(arm)
+        if time.monotonic() - given > AGAIN_S:  # a setpoint lasts for half a second
+            given = time.monotonic()
+            arm.command(goal, max(began + STEP_S - given, AGAIN_S))
+        time.sleep(LOOK_S)
+    raise RobotError(f"{JOINTS[JOINT]} did not move within {TIMEOUT_S:g} s of a command: check the speed slider")
+
+
+def _check_fault(arm: ArmProcess) -> None:
+    if fault := arm.fault:
+        raise RobotError(f"the robot stopped: {fault}")

@@ -1,0 +1,1 @@
+"""The Panda arm: a MuJoCo model and simulation."""

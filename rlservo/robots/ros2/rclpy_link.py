@@ -1,0 +1,194 @@
+"""Link through the machine's own rclpy: a node, and a thread that takes its messages."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import os
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rlservo.robots.arm_interface import RobotError
+from rlservo.robots.ros2.link import FIRST_MESSAGES_S, Endpoint, Publish, safely, wait_until
+
+GUARD = "rlservo_guard"  # publishes only zeros, when its own commander has fallen silent
+SERVICE_S = 3.0  # for a service to be discovered, and to answer
+KEPT_MESSAGES = 100  # each node of a graph keeps its own static transforms
+ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, also for the processes that we start
+
+
+class RclpyLink:
+    """A ROS 2 node with a unique name: two with one name could not be told apart."""
+
+    def __init__(self, name: str, *, is_unique: bool = False) -> None:
+        """Join the graph. `is_unique`: the name is used as it is, else with our process id. Raises RobotError."""
+        try:
+            import rclpy  # pyright: ignore[reportMissingImports]
+            from rclpy import executors  # pyright: ignore[reportMissingImports]
+            from rclpy.signals import SignalHandlerOptions  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise RobotError(
+                f"ROS 2's rclpy cannot be imported ({error}): source /opt/ros/DISTRIBUTION/setup.bash, and use the "
+                "Python that this ROS 2 is built for"
+            ) from error
+        self._context = rclpy.Context()
+        arguments = [one for one in os.environ.get(ARGUMENTS_VARIABLE, "").split("\n") if one]
+        given = ["--ros-args", *(arguments if is_unique else _without_names(arguments))] if arguments else None
+        try:
+            rclpy.init(args=given, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+            self.node: Any = rclpy.create_node(
+                name if is_unique else f"{name}_{os.getpid()}", context=self._context,
+                automatically_declare_parameters_from_overrides=is_unique,
+            )  # fmt: skip
+        except Exception as error:  # rcl's own errors share no public base
+            words = " ".join([name, *arguments])
+            why = " ".join(str(error).split())  # it may point at the place, on a line of its own
+            raise RobotError(f"ROS 2 does not accept the node's name or arguments, {words}: {why}") from error
+        self._own: Counter[tuple[str, str]] = Counter()  # endpoints of ours, by topic
+        self._executor = executors.SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+        def spin() -> None:
+            with contextlib.suppress(executors.ExternalShutdownException):
+                self._executor.spin()
+
+        self._thread = threading.Thread(target=spin, name="ros", daemon=True)
+        self._thread.start()
+        wait_until(lambda: self.now_s() > 0.0, "no message on /clock, which use_sim_time asks for", FIRST_MESSAGES_S)
+
+    def now_s(self) -> float:
+        """Return ROS's time [s]: the system's, or /clock's with use_sim_time."""
+        return float(self.node.get_clock().now().nanoseconds * 1e-9)
+
+    def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
+        """Subscribe to the newest message, best effort as for sensors; also to an earlier one if publishers keep it.
+
+        `is_kept`: to all that publishers keep, also those of publishers that are not discovered yet.
+        """
+        from rclpy.qos import QoSDurabilityPolicy  # pyright: ignore[reportMissingImports]
+
+        offered = {one.qos_profile.durability for one in self.node.get_publishers_info_by_topic(topic)}
+        keeps = is_kept or offered == {QoSDurabilityPolicy.TRANSIENT_LOCAL}
+        qos = self._qos(is_kept=keeps, is_reliable=False, depth=KEPT_MESSAGES if is_kept else 1)
+        made = self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), qos)
+        self._own["subscriber", made.topic_name] += 1
+
+    def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
+        """Publish reliably, only the newest message."""
+        made = message_class(kind)
+        publisher = self.node.create_publisher(made, topic, self._qos(is_kept=is_kept, is_reliable=True))
+        self._own["publisher", publisher.topic_name] += 1
+
+        def publish(values: Mapping[str, Any]) -> None:
+            if self._context.ok():
+                publisher.publish(fill(made(), values))
+
+        return publish
+
+    def serve(self, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
+        """Offer a std_srvs/Trigger service."""
+
+        def handle(_request: Any, response: Any) -> Any:
+            response.success, response.message = answer()
+            return response
+
+        self.node.create_service(message_class("std_srvs/srv/Trigger"), name, handle)
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """Return the publishers of other nodes."""
+        return self._others("publisher", topic, self.node.get_publishers_info_by_topic(topic))
+
+    def rivals(self, topic: str, since_s: float = 0.0) -> list[Endpoint]:
+        """Return the publishers of other nodes, as a robot obeys one; a guard does not count."""
+        del since_s  # they are known before their first message
+        return [one for one in self.publishers(topic) if not one.node.rpartition("/")[2].startswith(GUARD)]
+
+    def subscribers(self, topic: str) -> list[Endpoint]:
+        """Return the subscribers of other nodes."""
+        return self._others("subscriber", topic, self.node.get_subscriptions_info_by_topic(topic))
+
+    def strings(self, node: str, parameter: str) -> list[str] | None:
+        """Return a parameter of another node that is a list of strings; None if it cannot be read."""
+        kind = message_class("rcl_interfaces/srv/GetParameters")
+        client = self.node.create_client(kind, f"{node}/get_parameters")
+        try:
+            if not client.wait_for_service(timeout_sec=SERVICE_S):
+                return None
+            answered = threading.Event()
+            reply = client.call_async(kind.Request(names=[parameter]))
+            reply.add_done_callback(lambda _: answered.set())
+            values = reply.result().values if answered.wait(SERVICE_S) else []
+            return [*values[0].string_array_value] or None if values else None
+        finally:
+            self.node.destroy_client(client)
+
+    def close(self) -> None:
+        """Leave the graph and end the thread."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self._context.try_shutdown()
+        self._thread.join(2.0)
+        self.node.destroy_node()
+
+    def _others(self, which: str, topic: str, infos: Sequence[Any]) -> list[Endpoint]:
+        found = [Endpoint(f"{one.node_namespace.rstrip('/')}/{one.node_name}", one.topic_type) for one in infos]
+        own, others = self.node.get_fully_qualified_name(), []
+        mine = self._own[which, self.node.resolve_topic_name(topic)]
+        for one in found:  # another node may have our name
+            if one.node == own and mine:
+                mine -= 1
+            else:
+                others.append(one)
+        return others
+
+    @staticmethod
+    def _qos(*, is_kept: bool, is_reliable: bool, depth: int = 1) -> Any:
+        from rclpy import qos  # pyright: ignore[reportMissingImports]
+
+        reliable, best = qos.QoSReliabilityPolicy.RELIABLE, qos.QoSReliabilityPolicy.BEST_EFFORT
+        durability = qos.QoSDurabilityPolicy.TRANSIENT_LOCAL if is_kept else qos.QoSDurabilityPolicy.VOLATILE
+        return qos.QoSProfile(
+            depth=depth, reliability=reliable if is_reliable or is_kept else best, durability=durability
+        )
+
+
+@functools.cache
+def message_class(kind: str) -> Any:
+    """Return the class of 'sensor_msgs/msg/JointState'. Raises RobotError if its package is not installed."""
+    package, _, rest = kind.partition("/")
+    folder, _, name = rest.rpartition("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{folder or 'msg'}"), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise RobotError(f"the ROS 2 interface {kind!r} is not installed here: {error}") from error
+
+
+def message_fields(kind: str) -> Mapping[str, str]:
+    """Return the types of a message's fields, by name; `kind` is 'geometry_msgs/Twist', as those types are written."""
+    fields: Mapping[str, str] = message_class(kind.replace("/", "/msg/")).get_fields_and_field_types()
+    return fields
+
+
+def fill(message: Any, values: Mapping[str, Any]) -> Any:
+    """Set the fields of a message from a dictionary, and return it."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            fill(getattr(message, name), value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            kind = message.get_fields_and_field_types()[name].removeprefix("sequence<").partition(">")[0]
+            made = message_class(kind.replace("/", "/msg/"))
+            setattr(message, name, [fill(made(), one) for one in value])
+        else:
+            setattr(message, name, value)
+    return message
+
+
+def _without_names(arguments: Sequence[str]) -> list[str]:
+    """Return ROS arguments without those that would give all our nodes the same name."""
+    kept = list(arguments)
+    for index in reversed(range(len(kept))):
+        if kept[index].startswith(("__node:=", "__name:=")):
+            del kept[max(index - 1, 0) : index + 1]
+    return kept

@@ -1,0 +1,1 @@
+"""The UR arms: their parameters, and a MuJoCo model and simulation of each."""
