@@ -90,13 +90,18 @@ class ServoLoop:
 
     def run(self, on_ready: Callable[[], None]) -> None:
         """Command the arm until asked to end, then decelerate; `on_ready` is called after the first cycle."""
-        due, is_first = time.monotonic(), True
+        due = cycle_s = time.monotonic()
+        is_first = True
         while True:
             now = time.monotonic()
             if now < due:
                 time.sleep(due - now)
                 now = time.monotonic()
             due = max(due + self._dt, now - self._dt)
+            if now - cycle_s > AGE_BOUND_S:  # this process was suspended: the arm stands at its last setpoint
+                self._limiter.restart(self._limiter.position)
+                self._law.blend = 0.0
+            cycle_s = now
             self._look(now)
             self._check()
             if self.is_asked_to_end.is_set() and self._has_ended(now):

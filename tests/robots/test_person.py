@@ -132,16 +132,18 @@ except BaseException:
 """
 
 
-@pytest.mark.parametrize("silence_s", [0.9, 3.0])
-def test_policy_that_was_suspended_begins_slowly(arm: OutsideArm, silence_s: float) -> None:
+@pytest.mark.parametrize(("who", "silence_s"), [("policy", 0.9), ("policy", 3.0), ("stream", 0.4)])
+def test_process_that_was_suspended_begins_slowly(arm: OutsideArm, who: str, silence_s: float) -> None:
+    """Its stream's silence is within what the controller's watchdog allows here."""
     recorder = arm.recorder
     policy = subprocess.Popen([sys.executable, "-c", PROGRAM, arm.host])
     try:
         recorder.wait_until(lambda one: one.speed() > 0.9 * FASTEST)
-        policy.send_signal(signal.SIGSTOP)
+        suspended = policy.pid if who == "policy" else streams(policy)[0]
+        os.kill(suspended, signal.SIGSTOP)
         time.sleep(silence_s)
         assert recorder.speed() < STANDS
-        policy.send_signal(signal.SIGCONT)
+        os.kill(suspended, signal.SIGCONT)
         back_s = recorder.now_s()
         recorder.wait_until(lambda one: one.speed() > 0.9 * FASTEST)
     finally:
