@@ -29,6 +29,7 @@ from rlservo.drive.make_environment import check_fit, check_proven, make_env
 from rlservo.errors import DeadlineError, RlservoError, UsageError
 from rlservo.policy.acting_policy import ActingPolicy
 from rlservo.robots.arm_interface import RobotError
+from rlservo.robots.arm_states import Change, ControlState
 from rlservo.robots.operator_terminal import Operator
 from rlservo.robots.ros2.link import take_command
 from rlservo.robots.ros2.rclpy_link import RclpyLink
@@ -229,6 +230,7 @@ def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str,
         node.link.subscribe("~/target", POSE_STAMPED, target.take)
         for word, to_person in (("take_over", True), ("hand_back", False)):
             node.link.serve(f"~/{word}", partial(_lead, robot.simulation.operator, to_person=to_person))
+        robot.simulation.states.on_change = partial(_say_hold, node)
         robot.simulation.is_called_off = lambda: node.stop.is_set() or node.wanted is not Wanted.RUN
         starts = node.starts
         while not node.stop.is_set():
@@ -259,6 +261,12 @@ def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str,
             robot.simulation.advance()  # the model stays where the robot is
     finally:
         env.close()
+
+
+def _say_hold(node: PolicyNode, change: Change) -> None:
+    """Tell the heartbeat of a robot that holds, while the step waits for it; the drive tells the other states."""
+    if change.state == ControlState.HOLD.value and node.state in ("running", "blocked"):
+        node.enter(change.state, change.why)
 
 
 def _lead(operator: Operator, *, to_person: bool) -> tuple[bool, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
 
@@ -62,6 +63,7 @@ class StateMachine:
     def __init__(self) -> None:
         self.state = ControlState.CONNECT
         self.changes: list[Change] = []
+        self.on_change: Callable[[Change], object] = lambda _: None
 
     def enter(self, state: ControlState, why: str = "") -> None:
         """Change the state; does nothing if it is already in that state."""
@@ -73,6 +75,7 @@ class StateMachine:
         level = logging.WARNING if state in (ControlState.FAULT, ControlState.HUMAN) else logging.INFO
         log.log(level, "robot: %s -> %s%s", before.value, state.value, f": {why}" if why else "")
         self.changes.append(Change(time.time(), state.value, why))
+        self.on_change(self.changes[-1])
 
     def take_changes(self) -> list[Change]:
         """Return the changes since the last call."""

@@ -170,6 +170,8 @@ class RealRobot(ABC, Generic[RobotT, MeasuredT]):
         limit = time.monotonic() + FRESH_S
         state = self._newest()
         while _age_s(state) > self._age_bound_s and not self._note_fault():
+            if self.states.state in (ControlState.BLEND_IN, ControlState.RUN):  # said before it is waited for
+                self.states.enter(ControlState.HOLD, f"the robot's newest state is {_age_s(state):.2f} s old")
             if time.monotonic() > limit:
                 self.stopped_by = "stale_observation"
                 self.hold()

@@ -127,6 +127,22 @@ def test_base_reaches_its_targets_and_stands_when_its_process_stops_or_dies(
     assert ros.moved_for(began_s) < TIMEOUT_S + BRAKING_S
 
 
+def test_stale_inputs_are_said_while_they_are_waited_for(ros: Ros, sim: Process, all_shipped: Path) -> None:
+    node = start_node(ros, all_shipped)
+    node.wait_for("check -> ready")
+    get_moving(ros, 1.0)
+    began_s = time.time()
+    sim.type("latency 900")
+    try:
+        ros.wait_until(lambda: ros.heartbeat()["state"] == "hold")
+        assert time.time() - began_s < 3.0  # a fault comes after 5
+        node.wait_for("running -> hold: the robot's newest state is 0.")
+    finally:
+        sim.type("latency 0")
+    ros.wait_until(lambda: ros.heartbeat()["state"] in ("running", "arrived"))
+    assert node.end() == 0
+
+
 def test_second_node_that_comes_later_on_its_commands_or_odometry_is_a_fault(
     ros: Ros, sim: Process, all_shipped: Path
 ) -> None:
