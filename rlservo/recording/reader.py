@@ -101,14 +101,16 @@ class Recording:
     def entries(self) -> Iterator[Entry]:
         """Yield every decision and outcome, in the order they were written.
 
-        A file of a folder that was deleted meanwhile is left out. Raises RecordingError if a file is not an MCAP file,
-        or was written by another program.
+        A file of a folder that is empty, or was deleted meanwhile, is left out. Raises RecordingError if a file is not
+        an MCAP file, or was written by another program.
         """
         self.files = []
         for path in self.paths:
             facts = FileFacts(path, being_written=is_being_written(path))
             self.files.append(facts)
             try:
+                if path not in self._named and path.stat().st_size < len(MAGIC):
+                    continue  # its recorder was killed before it wrote
                 yield from FileReader(self, facts).entries()
             except FileNotFoundError:
                 if path in self._named:

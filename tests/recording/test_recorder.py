@@ -558,6 +558,11 @@ def test_a_file_that_the_recorder_deletes_meanwhile_is_left_out(ur5: Path, tmp_p
     done = rlservo_here("log", "info", folder)
     assert done.returncode == 0, done.stderr
     assert f"{first}: deleted before it was read" in done.stdout and "5 decisions" in done.stdout
+    first.unlink()
+    first.touch()  # its recorder was killed before it wrote
+    done = rlservo_here("log", "info", folder)
+    assert done.returncode == 0, done.stderr
+    assert f"{first}: 0 messages, without an end" in done.stdout and "5 decisions" in done.stdout
 
 
 def test_a_simulated_episode_is_as_long_as_its_steps_and_numbered_as_in_an_export(
