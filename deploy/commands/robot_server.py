@@ -15,6 +15,7 @@ from rlservo.deploy.commands.environment_options import parse_env_arguments, req
 from rlservo.deploy.terminal import Json, print_json, show_log
 from rlservo.errors import UsageError
 from rlservo.extras import needs_extra
+from rlservo.robots.ur.parameters import UR_PARAMETERS
 
 if TYPE_CHECKING:
     from rlservo.envs.robot_server.robot_server_settings import Settings
@@ -24,7 +25,7 @@ robot_server = typer.Typer(
     no_args_is_help=True,
 )
 
-
+MODELS = ", ".join(UR_PARAMETERS)
 Host = Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 for clients on other machines.")]
 Clock = Annotated[
     Literal["fast", "real"],
@@ -48,7 +49,7 @@ Limit = Annotated[
 
 @robot_server.command("ur")
 def robot_server_ur(
-    ur_model: Annotated[str, typer.Option(help="Model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5",
+    ur_model: Annotated[str, typer.Option(help=f"Model: {MODELS}.")] = "ur5",
     rs_mode: Annotated[
         str, typer.Option(help="Content of a state: only_robot, 1object, 1moving2points or 2objects2points.")
     ] = "only_robot",
@@ -215,7 +216,7 @@ def server_manager(
 
 def robot_latency(
     robot: Annotated[str, typer.Argument(metavar="ADDRESS", help="rtde://HOST, or ros2:NAME=VALUE,...")],
-    ur_model: Annotated[str, typer.Option(help="Model: ur3, ur3e, ur5, ur5e, ur10, ur10e or ur16e.")] = "ur5e",
+    ur_model: Annotated[str, typer.Option(help=f"Model: {MODELS}.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
     limit: Limit = None,
@@ -266,9 +267,7 @@ def robot_latency(
 
 
 def ur_controller(
-    model: Annotated[
-        str, typer.Option(help="ur3e, ur5e, ur10e or ur16e (500 Hz); ur3, ur5 or ur10 (125 Hz).")
-    ] = "ur5e",
+    model: Annotated[str, typer.Option(help=f"{MODELS}; of 500 Hz, but ur3, ur5 and ur10 of 125 Hz.")] = "ur5e",
     host: Annotated[
         str, typer.Option(help="Address to listen on; the ports are always 29999 and 30001 to 30004.")
     ] = "127.0.0.1",

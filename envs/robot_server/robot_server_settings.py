@@ -111,7 +111,7 @@ class ArmSettings(Common):
 
 @dataclass(frozen=True)
 class URSettings(ArmSettings):
-    """A robot server for one of the seven arms."""
+    """A robot server for a UR arm."""
 
     RS_MODES: ClassVar[Mapping[str, int]] = {name: mode.objects for name, mode in RS_MODES.items()}
     FRAMES = ("base_link", "base")

@@ -376,7 +376,7 @@ class URArmEnv(ArmEnv[URSimulation]):
         super().close()
 
     def set_robot_model(self, name: str) -> None:
-        """Put another arm on the table; call `reset` next. Raises ValueError naming the seven, and for a real arm."""
+        """Put another arm on the table; call `reset` next. Raises ValueError naming all, and for a real arm."""
         if self.is_real:
             raise ValueError(f"a real arm cannot be replaced by {name!r}")
         simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))

@@ -78,7 +78,7 @@ class BasicAvoidanceURSim(URArmEnv):
 
     ## Constructor
 
-    `ur_model` (ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e), `fix_base` ... `fix_wrist_3`, `include_polar_to_elbow`,
+    `ur_model` (ur5), `fix_base` ... `fix_wrist_3`, `include_polar_to_elbow`,
     `rs_state_to_info` (the robot server's `state_dict` of the mode `1moving2points` in `info["rs_state"]`; False keeps
     info picklable for RLlib), `render_mode`. Of our own: `max_velocity_scale_factor` (0.2) and `action_cycle_rate`
     (20 Hz), which robo-gym has in its launch file. robo-gym's `ip`, `lower_bound_port`, `upper_bound_port`, `gui`

@@ -81,7 +81,7 @@ class EndEffectorPositioningURSim(URArmEnv):
 
     ## Constructor
 
-    `ur_model` (ur3, ur3e, ur5, ur5e, ur10, ur10e, ur16e), `fix_base` ... `fix_wrist_3`, `restrict_wrist_1`,
+    `ur_model` (ur5), `fix_base` ... `fix_wrist_3`, `restrict_wrist_1`,
     `rs_state_to_info` (the robot server's `state_dict` in `info["rs_state"]`; False keeps info picklable for RLlib),
     `render_mode`. Of our own: `randomize_start` (the default of the reset option), `target` (the default of
     `ee_target_pose`: 'base_link:X,Y,Z', 'base:X,Y,Z' in the pendant's frame, or 'joints:' and six), and

@@ -26,7 +26,7 @@ from rlservo.robots.arm_port import ZERO_SCALE, ArmReading, ServoSettings
 from rlservo.robots.limits import Limits, MotionLimiter
 from rlservo.robots.rtde_driver import VARIABLES, reading_of
 from rlservo.robots.rtde_probe import no_answer, round_trip_s
-from rlservo.robots.ur.parameters import UR_PARAMETERS
+from rlservo.robots.ur.parameters import UR_PARAMETERS, model_of, rate_hz_of
 from rlservo.robots.ur.simulation import URSimulation
 
 WATCHED_S = 1.0  # [s] of states
@@ -79,18 +79,20 @@ def _dashboard(host: str, ur_model: str | None) -> tuple[str, list[Finding]]:
     dashboard = dashboard_client.DashboardClient(host)
     try:
         dashboard.connect()
-        version, family = dashboard.polyscopeVersion(), dashboard.getRobotModel().strip().lower()
+        version, family = dashboard.polyscopeVersion(), dashboard.getRobotModel()
         is_e_series = not version.startswith("3.")
         is_remote = dashboard.isInRemoteControl() if is_e_series else True
         dashboard.disconnect()
     except RuntimeError as error:
         raise RobotError(no_answer(host, error)) from error
-    model = family + ("e" if is_e_series else "")
+    model = model_of(family, version)
     problem = ""
     if model not in UR_PARAMETERS:
         problem = f"its kinematics are unknown here: expected one of {', '.join(UR_PARAMETERS)}"
-    elif ur_model not in (None, model):
+    elif ur_model is not None and UR_PARAMETERS.get(ur_model) != UR_PARAMETERS[model]:
         problem = f"ur_model is {ur_model}"
+    elif ur_model is not None:
+        model = ur_model  # a ur7e calls itself UR5
     return model, [
         Finding("software", version),
         Finding("model", model, problem),
@@ -107,7 +109,7 @@ def _dashboard(host: str, ur_model: str | None) -> tuple[str, list[Finding]]:
 def _over_rtde(host: str, model: str, limits: Limits) -> list[Finding]:
     import rtde_receive
 
-    rate_hz = limits.rate_hz or (500.0 if model.endswith("e") else 125.0)
+    rate_hz = limits.rate_hz or rate_hz_of(model)
     try:
         receive = rtde_receive.RTDEReceiveInterface(host, rate_hz, VARIABLES)
     except Exception as error:  # RuntimeError, boost's own

@@ -12,6 +12,7 @@ from rlservo.robots.arm_interface import RUNNING, SAFE_MODES, STOP_NAMES, RobotE
 from rlservo.robots.arm_port import ZERO_SCALE, ArmReading, ServoSettings
 from rlservo.robots.following_error import FollowingBound
 from rlservo.robots.rtde_probe import no_answer
+from rlservo.robots.ur.parameters import CB3, UR_PARAMETERS, model_of, rate_hz_of
 
 FIRST_STATE_S = 5.0
 IS_PROGRAM_RUNNING = 2  # bit of the robot's status
@@ -42,11 +43,11 @@ class RtdeDriver:
             dashboard = dashboard_client.DashboardClient(host)
             dashboard.connect()
             self._check_model(settings, dashboard.getRobotModel(), dashboard.polyscopeVersion())
-            is_local = settings.ur_model.endswith("e") and not dashboard.isInRemoteControl()
+            is_local = settings.ur_model not in CB3 and not dashboard.isInRemoteControl()
             dashboard.disconnect()
         except RuntimeError as error:
             raise RobotError(no_answer(host, error)) from error
-        fastest = 500.0 if settings.ur_model.endswith("e") else 125.0
+        fastest = rate_hz_of(settings.ur_model)
         self.rate_hz = limits.rate_hz or fastest
         if self.rate_hz > fastest:
             raise RobotError(f"limits: rate_hz is {self.rate_hz:g}: the controller takes at most {fastest:g}")
@@ -97,9 +98,8 @@ class RtdeDriver:
         self._control.kickWatchdog()
 
     def _check_model(self, settings: ServoSettings, model: str, version: str) -> None:
-        is_e_series = not version.startswith("3.")
-        found = model.strip().lower() + ("e" if is_e_series else "")
-        if found != settings.ur_model:
+        found = model_of(model, version)
+        if UR_PARAMETERS.get(found) != UR_PARAMETERS[settings.ur_model]:
             raise RobotError(f"the controller at {settings.host} is a {found}'s, but ur_model is {settings.ur_model}")
 
     def _check_modes(self, host: str) -> None:

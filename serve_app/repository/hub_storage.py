@@ -32,6 +32,8 @@ class HubStorage:
         self._repository, _, revision = self.uri.removeprefix("hf://").partition("@")
         self._revision: str | None = revision or None
         self._beside: Mapping[str, bytes] = {}
+        self.pinned = self.uri
+        """The repository at the commit that `create` made."""
 
     def read(self, name: str, most: int) -> tuple[bytes, str]:
         """Return a file, and the commit it was read at for `create`.
@@ -77,13 +79,14 @@ class HubStorage:
         operations = [CommitOperationAdd(path, data) for path, data in {**self._beside, name: content}.items()]
         with self._named(name):
             try:
-                self._api().create_commit(
+                made = self._api().create_commit(
                     self._repository, operations, commit_message="Publish with rlservo", parent_commit=tag or None
                 )
             except HfHubHTTPError as error:
                 if error.response.status_code not in (409, 412):  # another commit came first
                     raise
                 return False
+        self.pinned = f"{self.uri}@{made.oid}"
         return True
 
     def _fetch(self, name: str, most: int) -> tuple[Path, str]:

@@ -27,7 +27,7 @@ ATTEMPTS = 20  # at the index, each after others have published
 
 
 def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[str], object] = str) -> str:
-    """Publish a bundle to a folder or URI under its own name and version; return where it is.
+    """Publish a bundle to a folder or URI under its own name and version; return where it is: on a hub, the commit.
 
     `card` is the README.md of a hub's repository. `progress` gets a line per uploaded file. Raises ConflictError if
     that version is there, or is being published, UsageError if nothing can be written, UnavailableError if the
@@ -60,7 +60,7 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
                 )
     for attempt in range(ATTEMPTS):
         if storage.create(INDEX, content, tag):
-            return target
+            return storage.pinned if isinstance(storage, HubStorage) else target
         time.sleep(0.05 * attempt)
         index, tag = Index.read(storage)
         if index.hash_of(bundle) == bundle.digest:

@@ -45,6 +45,22 @@ def test_robot_that_may_be_driven_is_described_and_not_touched(arm: RunningArm) 
     assert not arm.controller.stop_reasons and not arm.controller.is_program_running
 
 
+@pytest.mark.parametrize(
+    ("model", "reported"), [("ur7e", "ur5e"), ("ur12e", "ur10e"), ("ur18", "ur18"), ("ur30", "ur30")]
+)
+def test_models_sold_today_are_known_by_what_their_controller_says(model: str, reported: str) -> None:
+    """A UR7e calls itself UR5, whose figures it has."""
+    for arm in run_arm(model):
+        assert check(arm)[1]["model"]["found"] == reported
+        code, found = check(arm, "--ur-model", model)
+        assert (code, found["model"]["found"]) == (0, model), found
+        assert check(arm, "--ur-model", "ur20")[1]["model"]["problem"] == "ur_model is ur20"
+        with closing(ArmProcess(arm.host, model)) as real:
+            assert real.arm_state().positions == pytest.approx([0.0, -2.5, 1.5, -1.5, -1.4, 0.0], abs=0.01)
+        with pytest.raises(RobotError, match=f"is a {reported}'s, but ur_model is ur20"):
+            ArmProcess(arm.host, "ur20")
+
+
 FAULTS: dict[str, tuple[Callable[[Any], object], str, str]] = {
     "slider": (lambda one: setattr(one, "speed_fraction", 0.0), "speed slider", "raise it on the pendant"),
     "stop": (lambda one: one.stop_protectively("a test"), "safety mode", "find the cause, then unlock it"),

@@ -21,7 +21,7 @@ OLD_LIST = ("0", "1", "2", "3", "4", "5", *(f"{JOINTS[index]}_joint_position" fo
 
 
 class URRobot(ArmRobot[URSimulation]):
-    """One of the seven arms; a reference frame `base` is turned by pi against base_link."""
+    """A UR arm; a reference frame `base` is turned by pi against base_link."""
 
     ORDER = ROS_ORDER
     POSITION_NAMES = tuple(f"{joint}_joint_position" for joint in JOINTS)

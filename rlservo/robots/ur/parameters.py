@@ -1,7 +1,9 @@
-"""Parameters of the seven arms, in one table; everything else about them is computed from it.
+"""Parameters of the arms, in one table; everything else about them is computed from it.
 
-Sources: kinematics, link frames, masses and limits from ros-industrial/universal_robot (ur_description); workspace
-radii, the start pose and its randomisation from jr-robotics/robo-gym 2.0. Joints are in standard order everywhere.
+Sources, of robo-gym's seven: kinematics, link frames, masses and limits from ros-industrial/universal_robot
+(ur_description); workspace radii, the start pose and its randomisation from jr-robotics/robo-gym 2.0. Of the others:
+UniversalRobots/Universal_Robots_ROS2_Description (a UR7e has the UR5e's figures, a UR12e the UR10e's); their workspace
+radii are nine tenths of the reach. Joints are in standard order everywhere.
 """
 
 from __future__ import annotations
@@ -76,6 +78,30 @@ _UR16 = _UR10 | {
 }
 
 
+_UR15 = {
+    "masses": (4.0, 9.9883, 14.9255, 6.1015, 2.089, 2.0869, 1.0666),
+    "velocity_limits": (_PI, _PI, 4 * _PI / 3, 5 * _PI / 3, 5 * _PI / 3, 5 * _PI / 3),
+    "effort_limits": (433.0, 433.0, 204.0, 70.0, 70.0, 70.0),
+    "workspace_radius": 1.17,
+    "workspace_min_radius": 0.3,
+}
+_UR18 = _UR15 | {
+    "masses": (4.0, 9.9883, 14.2009, 5.52, 2.089, 2.0869, 1.0666),
+    "workspace_radius": 0.85,
+}
+_UR20 = {
+    "masses": (4.0, 16.343, 29.632, 7.879, 3.054, 3.126, 0.926),
+    "velocity_limits": (2 * _PI / 3, 2 * _PI / 3, 5 * _PI / 6, 7 * _PI / 6, 7 * _PI / 6, 7 * _PI / 6),
+    "effort_limits": (738.0, 738.0, 433.0, 107.0, 107.0, 107.0),
+    "workspace_radius": 1.57,
+    "workspace_min_radius": 0.4,
+}
+_UR30 = _UR20 | {
+    "masses": (4.0, 16.343, 28.542, 7.156, 3.054, 3.126, 0.926),
+    "workspace_radius": 1.17,
+}
+
+
 def _arm(kinematics: tuple[float, ...], shared: dict[str, object]) -> URParameters:
     return URParameters(*kinematics, **shared)  # type: ignore[arg-type]  # the dicts above spell the field names
 
@@ -89,7 +115,15 @@ UR_PARAMETERS: dict[str, URParameters] = {
     "ur10": _arm((0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 0.220941, 0.049042), _UR10),
     "ur10e": _arm((0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 0.1762, 0.0393), _UR10),
     "ur16e": _arm((0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 0.176, 0.04), _UR16),
+    # The UR15's and UR18's centre lines are judged by their links' centres of mass, beside those of UR10e and UR20.
+    "ur15": _arm((0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 0.21, 0.041), _UR15),
+    "ur18": _arm((0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, 0.21, 0.041), _UR18),
+    "ur20": _arm((0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 0.26, 0.043), _UR20),
+    "ur30": _arm((0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, 0.26, 0.043), _UR30),
 }
+UR_PARAMETERS |= {"ur7e": UR_PARAMETERS["ur5e"], "ur12e": UR_PARAMETERS["ur10e"]}
+
+CB3 = ("ur3", "ur5", "ur10")  # of a controller with 125 Hz and no remote control; the others' have 500 Hz
 
 
 def cycle_of(rate_hz: float) -> float:
@@ -101,7 +135,21 @@ def cycle_of(rate_hz: float) -> float:
 
 
 def ur_parameters(model: str) -> URParameters:
-    """Return the parameters of one arm, or raise ValueError naming the seven."""
+    """Return the parameters of one arm, or raise ValueError naming all."""
     if model not in UR_PARAMETERS:
         raise ValueError(f"ur_model {model!r} does not exist: expected one of {', '.join(UR_PARAMETERS)}")
     return UR_PARAMETERS[model]
+
+
+def model_of(reported: str, version: str) -> str:
+    """Return the model by a controller's own words: 'UR5' is a ur5 or, with PolyScope 5 ('5.12.2'), a ur5e.
+
+    A UR7e calls itself UR5, and a UR12e UR10: their figures are the same.
+    """
+    family = reported.strip().lower()
+    return family if version.startswith("3.") or f"{family}e" not in UR_PARAMETERS else f"{family}e"
+
+
+def rate_hz_of(model: str) -> float:
+    """Return the rate of a model's controller [Hz]."""
+    return 125.0 if model in CB3 else 500.0

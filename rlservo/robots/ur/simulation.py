@@ -36,7 +36,7 @@ REACHED = 1e-6  # [m], and [rad]
 REACH_DAMPING = 0.05  # [m], keeps the joints calm when the arm is stretched
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")  # the moving links
-MAX_PAYLOAD = 20.0  # [kg], more than the largest arm carries (ur16e: 16 kg)
+MAX_PAYLOAD = 35.0  # [kg], what the strongest arm carries, a ur30
 
 
 class _DataSheet(NamedTuple):

@@ -229,8 +229,8 @@ def test_a_bundle_is_published_in_one_commit_and_served_by_revision_without_the_
 ) -> None:
     said = rlservo(hub, tmp_path, "publish", ur5, "hf://owner/arm", "--license", "apache-2.0")
     assert said.returncode == 0, said.stderr
-    assert f"hf://owner/arm/ur5/{ur5.name}" in said.stdout
     (_, _), (sha, files) = hub.commits["owner/arm"]
+    assert said.stdout == f"ur5 version {ur5.name} is published: hf://owner/arm@{sha}\n"
     assert {"index.json", "README.md", f"ur5/{ur5.name}/policy.onnx", f"ur5/{ur5.name}/SHA256SUMS"} <= set(files)
     assert b'license: "apache-2.0"' in files["README.md"] and b"rlservo serve hf://owner/arm" in files["README.md"]
     assert hub.private == {"owner/arm"}

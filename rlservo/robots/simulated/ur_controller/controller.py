@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlservo.robots.simulated.ur_controller.motion import Motion, MoveJ, Ramp, Servo
 from rlservo.robots.simulated.ur_controller.tool import Tool
-from rlservo.robots.ur.parameters import JOINTS, POSITION_LIMITS
+from rlservo.robots.ur.parameters import CB3, JOINTS, POSITION_LIMITS, rate_hz_of
 from rlservo.robots.ur.simulation import URSimulation
 
 log = logging.getLogger("rlservo.ur_controller")
@@ -85,8 +85,8 @@ class Controller:
 
     def __init__(self, ur_model: str = "ur5e") -> None:
         self.ur_model = ur_model
-        self.is_e_series = ur_model.endswith("e")
-        self.rate_hz = 500.0 if self.is_e_series else 125.0
+        self.is_e_series = ur_model not in CB3
+        self.rate_hz = rate_hz_of(ur_model)
         self.version = (5, 12, 2, 1101534) if self.is_e_series else (3, 15, 8, 106339)
         self.dt = 1.0 / self.rate_hz
         self.simulation = URSimulation(ur_model, max_velocity_scale=1.0, cycle_s=self.dt, objects=())

@@ -42,7 +42,7 @@ def answer(controller: Controller, line: str) -> str:
     if command == "polyscopeversion":
         return f"URSoftware {'.'.join(map(str, controller.version))} (simulated)"
     if command == "get robot model":
-        return controller.ur_model.removesuffix("e").upper()
+        return {"ur7e": "UR5", "ur12e": "UR10"}.get(controller.ur_model, controller.ur_model.removesuffix("e").upper())
     if command == "is in remote control":
         return str(controller.is_remote).lower()
     if command == "robotmode":
