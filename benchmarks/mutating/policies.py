@@ -116,7 +116,7 @@ def rsl_rl(folder: Path, **actor: Any) -> MutatedPolicy:
     tests = _helper("test_rsl_rl")
     run = folder / f"rsl_rl{'_'.join(['', *actor])}" / "run"
     tests.train(run, {**tests.settings(**actor), "clip_actions": 2.0}, tests.environment({}))
-    return _from_path("rsl rl", run)
+    return _from_path("rsl rl", run, joint_order=tests.ROBOT)
 
 
 def rsl_rl_gru(folder: Path) -> MutatedPolicy:
