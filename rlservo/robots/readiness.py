@@ -58,7 +58,7 @@ def look_at(robot: str, ur_model: str | None, limits: Mapping[str, Any]) -> tupl
 
         model = ur_model or "ur5e"
         with closing(RosArmConnection(ServoSettings(host, model, 0.1, 0.25, checked, 0, 0))) as driver:
-            return model, [Finding("model", f"{model} (given)"), *_state(driver.read, model, checked)]
+            return model, [Finding("model", f"{model} (given)", _unknown(model)), *_state(driver.read, model, checked)]
     model, findings = _dashboard(host, ur_model)
     return model, [*findings, *_over_rtde(host, model, checked)]
 
@@ -86,13 +86,12 @@ def _dashboard(host: str, ur_model: str | None) -> tuple[str, list[Finding]]:
     except RuntimeError as error:
         raise RobotError(no_answer(host, error)) from error
     model = model_of(family, version)
-    problem = ""
-    if model not in UR_PARAMETERS:
-        problem = f"its kinematics are unknown here: expected one of {', '.join(UR_PARAMETERS)}"
-    elif ur_model is not None and UR_PARAMETERS.get(ur_model) != UR_PARAMETERS[model]:
-        problem = f"ur_model is {ur_model}"
-    elif ur_model is not None:
-        model = ur_model  # a ur7e calls itself UR5
+    problem = _unknown(model)
+    if ur_model is not None and not problem:
+        if UR_PARAMETERS.get(ur_model) == UR_PARAMETERS[model]:
+            model = ur_model  # a ur7e calls itself UR5
+        else:
+            problem = f"ur_model is {ur_model}"
     return model, [
         Finding("software", version),
         Finding("model", model, problem),
@@ -104,6 +103,12 @@ def _dashboard(host: str, ur_model: str | None) -> tuple[str, list[Finding]]:
         Finding("calibration", "not read: kinematics are the data sheet's"),
         Finding("round trip", f"{1e3 * round_trip_s(host):.1f} ms"),
     ]
+
+
+def _unknown(model: str) -> str:
+    if model in UR_PARAMETERS:
+        return ""
+    return f"its kinematics are unknown here: expected one of {', '.join(UR_PARAMETERS)}"
 
 
 def _over_rtde(host: str, model: str, limits: Limits) -> list[Finding]:

@@ -294,3 +294,25 @@ def test_second_node_that_comes_later_is_a_fault_of_the_arm(ros: Ros, free_arm: 
         node.wait_for(f"fault: {reason}")
         assert node.end() == 0
         ros.ask("withdraw", topic=topic)
+
+
+def check(ros: Ros, *options: object) -> tuple[int, dict[str, dict[str, str]]]:
+    """Return robot-check's exit code and findings by name."""
+    process = ros.rlservo("robot-check", f"ros2:prefix={PREFIX}", "--json", *options)
+    code = process.end(0)
+    text = "\n".join(process.lines)
+    return code, {one["what"]: one for one in json.loads(text[text.index("{") :])["findings"]}
+
+
+def test_robot_check_describes_an_arm_on_ros_and_says_what_is_missing(ros: Ros, sim: Process, free_arm: None) -> None:
+    code, found = check(ros, "--ur-model", "ur5")
+    assert code == 0, found
+    assert found["model"]["found"] == "ur5 (given)" and found["robot mode"]["found"] == "running"
+    code, found = check(ros, "--ur-model", "ur99")
+    assert code == 1 and "expected one of ur3, ur3e" in found["model"]["problem"]
+    sim.type("slider 0")
+    try:
+        code, found = check(ros, "--ur-model", "ur5")
+        assert code == 1 and found["speed slider"]["problem"] == "raise it on the pendant"
+    finally:
+        sim.type("slider 1")
