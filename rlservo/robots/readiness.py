@@ -58,7 +58,10 @@ def look_at(robot: str, ur_model: str | None, limits: Mapping[str, Any]) -> tupl
 
         model = ur_model or "ur5e"
         with closing(RosArmConnection(ServoSettings(host, model, 0.1, 0.25, checked, 0, 0))) as driver:
-            return model, [Finding("model", f"{model} (given)", _unknown(model)), *_state(driver.read, model, checked)]
+            return model, [
+                Finding("model", f"{model} ({'given' if ur_model else 'assumed: give --ur-model'})", _unknown(model)),
+                *_state(driver.read, model, checked),
+            ]
     model, findings = _dashboard(host, ur_model)
     return model, [*findings, *_over_rtde(host, model, checked)]
 
