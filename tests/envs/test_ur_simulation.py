@@ -43,7 +43,9 @@ def test_forward_kinematics_equals_denavit_hartenberg(model: str) -> None:
         assert np.abs(sim.tool_rotation - turn @ expected[:3, :3]).max() < 1e-6
 
 
-@pytest.mark.parametrize(("model", "reach"), [("ur15", 1.3), ("ur18", 0.95), ("ur20", 1.75), ("ur30", 1.3)])
+@pytest.mark.parametrize(
+    ("model", "reach"), [("ur8long", 1.75), ("ur15", 1.3), ("ur18", 0.95), ("ur20", 1.75), ("ur30", 1.3)]
+)
 def test_stretched_arm_reaches_as_far_as_its_data_sheet_says(model: str, reach: float) -> None:
     """The reach is that of wrist 2's axis: the tool stands across."""
     sim = URSimulation(model, objects=())

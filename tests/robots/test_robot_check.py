@@ -46,7 +46,8 @@ def test_robot_that_may_be_driven_is_described_and_not_touched(arm: RunningArm) 
 
 
 @pytest.mark.parametrize(
-    ("model", "reported"), [("ur7e", "ur5e"), ("ur12e", "ur10e"), ("ur18", "ur18"), ("ur30", "ur30")]
+    ("model", "reported"),
+    [("ur7e", "ur5e"), ("ur12e", "ur10e"), ("ur18", "ur18"), ("ur8long", "ur8long"), ("ur30", "ur30")],
 )
 def test_models_sold_today_are_known_by_what_their_controller_says(model: str, reported: str) -> None:
     """A UR7e calls itself UR5, whose figures it has."""

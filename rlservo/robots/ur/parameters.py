@@ -89,6 +89,13 @@ _UR18 = _UR15 | {
     "masses": (4.0, 9.9883, 14.2009, 5.52, 2.089, 2.0869, 1.0666),
     "workspace_radius": 0.85,
 }
+# A UR8 Long has the UR15's joints and longer tubes. Its masses follow from the UR15's and UR18's by length, and its
+# speeds are the UR20's, which has that reach and is slow: neither was found.
+_UR8_LONG = _UR15 | {
+    "masses": (4.0, 9.9883, 15.98, 6.75, 2.089, 2.0869, 1.0666),
+    "velocity_limits": (2 * _PI / 3, 2 * _PI / 3, 5 * _PI / 6, 7 * _PI / 6, 7 * _PI / 6, 7 * _PI / 6),
+    "workspace_radius": 1.57,
+}
 _UR20 = {
     "masses": (4.0, 16.343, 29.632, 7.879, 3.054, 3.126, 0.926),
     "velocity_limits": (2 * _PI / 3, 2 * _PI / 3, 5 * _PI / 6, 7 * _PI / 6, 7 * _PI / 6, 7 * _PI / 6),
@@ -115,7 +122,8 @@ UR_PARAMETERS: dict[str, URParameters] = {
     "ur10": _arm((0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 0.220941, 0.049042), _UR10),
     "ur10e": _arm((0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 0.1762, 0.0393), _UR10),
     "ur16e": _arm((0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 0.176, 0.04), _UR16),
-    # The UR15's and UR18's centre lines are judged by their links' centres of mass, beside those of UR10e and UR20.
+    # These three centre lines are judged by their links' centres of mass, beside those of UR10e and UR20.
+    "ur8long": _arm((0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434, 0.21, 0.041), _UR8_LONG),
     "ur15": _arm((0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 0.21, 0.041), _UR15),
     "ur18": _arm((0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, 0.21, 0.041), _UR18),
     "ur20": _arm((0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 0.26, 0.043), _UR20),
@@ -146,7 +154,7 @@ def model_of(reported: str, version: str) -> str:
 
     A UR7e calls itself UR5, and a UR12e UR10: their figures are the same.
     """
-    family = reported.strip().lower()
+    family = reported.strip().lower().replace(" ", "").replace("_", "")
     return family if version.startswith("3.") or f"{family}e" not in UR_PARAMETERS else f"{family}e"
 
 
