@@ -127,7 +127,8 @@ def served_in_thread(dirs: Sequence[Path], **options: Any) -> Iterator[int]:
     def serve() -> None:
         try:
             with tempfile.TemporaryDirectory() as plans:
-                options["settings"] = {"plan": plans, **options.get("settings", {})}
+                # On a busy machine the test's own thread keeps the server's from running for a second.
+                options["settings"] = {"plan": plans, "max_queue_ms": 60_000.0, **options.get("settings", {})}
                 serve_policies(dirs, port=port, on_ready=lambda _: ready.set(), stop=stop, **options)
         except BaseException as error:
             failures.append(error)

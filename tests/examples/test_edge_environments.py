@@ -12,7 +12,7 @@ import pytest
 
 from rlservo.policy.policy import Policy
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]  # a dozen trainings, beside other tests
 
 
 @pytest.fixture(scope="module")
