@@ -95,7 +95,8 @@ class GivenOnnx(Source):
         if CONTRACT_KEY in metadata:
             raise UsageError(f"{file} is the graph of a bundle: serve or publish the bundle as it is")
         session = open_given(file)
-        tensors = describe_graph(file, model.graph, *one_row(file, session), options.outputs)
+        defaults = {one.name: one.shape for one in session.get_overridable_initializers()}
+        tensors = describe_graph(file, model.graph, *one_row(file, session), options.outputs, defaults)
         observed = tensors.description.given
         annotations = read_annotations(file, metadata, int(np.prod(tensors.action.row)), options.joint_order)
         main = next((tensor for name, tensor in observed.items() if name is None or name in OBSERVATIONS), None)

@@ -40,11 +40,13 @@ def describe_graph(
     inputs: Mapping[str, NDArray[Any]],
     outputs: Mapping[str, NDArray[Any]],
     uses: Mapping[str, str],
+    defaults: Mapping[str, Sequence[Any]],
 ) -> Tensors:
     """Return the tensors of an ONNX graph, given an example of each, one row, and what the user says of outputs.
 
-    `uses` has for an output `action`, `none`, or the input that gets it at the next step. Raises UnsupportedError for
-    tensors other than float32, UsageError where names do not tell an output's use.
+    `defaults` are the shapes of inputs that have a value of their own, such as weights. `uses` has for an output
+    `action`, `none`, or the input that gets it at the next step. Raises UnsupportedError for tensors other than
+    float32, UsageError where names do not tell an output's use.
     """
     for name, target in uses.items():
         if name not in outputs or target not in ("action", "none", *inputs):
@@ -63,6 +65,13 @@ def describe_graph(
             "the action"
         )
     for name in left:
+        valued = [one for one, shape in defaults.items() if tuple(shape) == outputs[name].shape]
+        if name != chosen[0] and valued and name not in uses:
+            raise UsageError(
+                f"{file.name}: the output '{name}' has the shape of '{valued[0]}', an input with a value of its own: "
+                "if it is its value at the next step, export the model without that value, else give "
+                f"--output {name}=none"
+            )
         twins = [one for one in inputs if one not in pairs and inputs[one].shape == outputs[name].shape]
         if name != chosen[0] and twins and name not in uses:
             raise UsageError(

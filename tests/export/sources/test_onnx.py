@@ -403,6 +403,23 @@ def test_outputs_whose_names_tell_nothing_are_asked_for_one_by_one(tmp_path: Pat
         np.testing.assert_allclose(policy.act(np.ones(4, np.float32)), np.sin(2 * np.ones(4)), rtol=1e-6)
 
 
+def test_a_memory_with_a_value_of_its_own_is_asked_for_and_a_constant_is_kept(tmp_path: Path) -> None:
+    """Its input is no input to onnxruntime: it was left at that value, and the memory was lost."""
+    given = state_of_other_names(tmp_path)
+    model = onnx.load(str(given.model))
+    model.graph.input.remove(model.graph.input[1])
+    model.graph.input.append(helper.make_tensor_value_info("hidden", FLOAT, [1, 4]))
+    model.graph.initializer.append(helper.make_tensor("hidden", FLOAT, [1, 4], [1.0, -1.0, 0.0, 2.0]))
+    onnx.save(model, str(given.model))
+    with pytest.raises(UsageError, match="'new_hidden' has the shape of 'hidden', an input with a value of its own"):
+        export(given, tmp_path / "out", outputs={"mu": "action"})
+    result = export(given, tmp_path / "out", outputs={"mu": "action", "new_hidden": "none"})
+    with Policy.load(result.path) as policy:
+        for _ in range(2):
+            wanted = np.sin(np.ones(4) + [1.0, -1.0, 0.0, 2.0])
+            np.testing.assert_allclose(policy.act(np.ones(4, np.float32)), wanted, rtol=1e-6)
+
+
 def test_a_custom_operator_is_refused_by_name(tmp_path: Path) -> None:
     given = microduck(tmp_path)
     model = onnx.load(str(given.model))
