@@ -172,7 +172,7 @@ def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> Restor
     policy = TorchPolicy(recipe, exported, _traced(len(memory)), lambda: reference)
     observed = observation_elements(environment, groups, actor.obs_dim, terms, joint_order)
     elements = ElementNames(observed, terms.elements, terms.control_rate_hz)
-    return restored(policy, elements, str(file), f"{type(actor).__module__}.{type(actor).__qualname__}", untrained)
+    return restored(policy, elements, str(file), _name(actor), untrained)
 
 
 def _acting_part(
@@ -309,19 +309,75 @@ class _RslRlReference:
         except Exception as error:  # the user's own classes, or settings that no runner takes
             raise CheckpointError(f"{file} cannot be restored by rsl_rl's own runner: {explain(error)}") from error
         self._policy = self._runner.get_inference_policy()
+        self._is_own = not all(
+            kind.__module__.startswith(("rsl_rl.", "torch.", "builtins")) for kind in type(self._policy).__mro__
+        )
+        if self._is_own and len(self._widths) > 1:
+            raise UnsupportedError(
+                f"{file}: its {part} is of a class of its own ({_name(self._policy)}), which may treat the groups "
+                f"{', '.join(self._widths)} apart; their sizes are in no file, so it cannot be compared"
+            )
+        if self._policy.is_recurrent:
+            self._check_begin(file, sizes[0])
         self._process = process_actions(environment, joint_order, settings.get("clip_actions"))
 
     def __call__(self, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
-        from tensordict import TensorDict
-
         if state:
             hidden = [leaf.transpose(0, 1).contiguous() for leaf in state]
             self._policy.reset(hidden_state=tuple(hidden) if len(hidden) > 1 else hidden[0])
-        groups = dict(zip(self._widths, obs.split(list(self._widths.values()), dim=-1), strict=True))
-        action = self._policy(TensorDict(groups, batch_size=[len(obs)]))
-        after = self._policy.get_hidden_state() if state else ()
-        after = after if isinstance(after, tuple) else (after,)
+        action = self._policy(self._observed(obs))
+        after = self._memory() if state else []
         return self._process(action), [leaf.transpose(0, 1) for leaf in after]
+
+    def _memory(self) -> list[Tensor]:
+        hidden = self._policy.get_hidden_state()
+        return list(hidden) if isinstance(hidden, tuple) else [hidden]
+
+    def _observed(self, obs: Any) -> Any:
+        """Return the policy's observation. A class of the user's own may not ask whether there are other groups."""
+        from tensordict import TensorDict
+
+        policy, own = _name(self._policy), tuple(self._widths)
+
+        class Groups(TensorDict):  # type: ignore[no-untyped-call]
+            def keys(self, *_: Any, **__: Any) -> Any:
+                raise UnsupportedError(
+                    f"{policy} asks which observation groups there are: it may read others than {own}"
+                )
+
+            def get(self, key: Any, *default: Any, **more: Any) -> Any:
+                if key not in own:
+                    raise UnsupportedError(f"{policy} asks for the observation group {key!r}: its obs_groups are {own}")
+                return super().get(key, *default, **more)
+
+        groups = dict(zip(own, obs.split(list(self._widths.values()), dim=-1), strict=True))
+        return (Groups if self._is_own else TensorDict)(groups, batch_size=[len(obs)])
+
+    def _check_begin(self, file: Path, size: int) -> None:
+        """Raise UnsupportedError for a memory that begins an episode, the first or another, otherwise than at zero."""
+        import torch
+
+        with torch.random.fork_rng(), torch.no_grad():
+            obs = self._observed(torch.randn(2, size))
+        with torch.no_grad():
+            first = self._policy(obs)
+            zeros = [torch.zeros_like(leaf) for leaf in self._memory()]
+            self._policy.reset(hidden_state=tuple(zeros) if len(zeros) > 1 else zeros[0])
+            from_zero = self._policy(obs)
+            before = [leaf.clone() for leaf in self._memory()]
+            self._policy.reset(torch.tensor([1, 0]))
+            after = self._memory()
+        begins = all(not new[..., 0, :].any() and torch.equal(new[..., 1, :], old[..., 1, :])
+                     for new, old in zip(after, before, strict=True))  # fmt: skip
+        if not (begins and torch.allclose(first, from_zero, atol=1e-6)):
+            raise UnsupportedError(
+                f"{file}: {_name(self._policy)} does not begin an episode with a memory of zeros, as rsl_rl's own "
+                "models do: not exported"
+            )
+
+
+def _name(model: Any) -> str:
+    return f"{type(model).__module__}.{type(model).__qualname__}"
 
 
 def _runner(file: Path, settings: dict[str, Any], part: str, sizes: tuple[int, int]) -> tuple[Any, dict[str, int]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import shutil
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -163,6 +164,84 @@ def test_isaac_labs_run_becomes_joint_targets(memory: str, tmp_path: Path, notic
     assert len(contract.state) == {"none": 0, "lstm": 2, "gru": 1}[memory]
     assert (contract.provenance.algorithm, contract.provenance.training_iterations) == ("PPO", 2)
     assert not any("loading" in notice for notice in notices)  # nothing is unpickled
+
+
+OWN_MODELS = """
+from rsl_rl.models import MLPModel, RNNModel
+from torch.nn import Module, Sequential
+
+class Half(Module):
+    def forward(self, given):
+        return 0.5 * given
+
+class Mine(MLPModel):
+    def forward(self, obs, *rest, **more):
+        return 0.5 * super().forward(obs, *rest, **more)
+
+    def as_onnx(self, verbose):
+        network = super().as_onnx(verbose)
+        network.mlp = Sequential(network.mlp, Half())
+        return network
+
+class Begins(RNNModel):
+    def reset(self, dones=None, hidden_state=None):
+        super().reset(dones, hidden_state)
+        if dones is not None and self.rnn.hidden_state is not None:
+            self.rnn.hidden_state[..., dones == 1, :] = 1.0
+
+class BeginsElsewhere(RNNModel):
+    def forward(self, obs, masks=None, hidden_state=None, stochastic_output=False):
+        if self.rnn.hidden_state is None:
+            self.rnn.hidden_state = obs["policy"].new_ones(1, len(obs["policy"]), 4)
+        return super().forward(obs, masks, hidden_state, stochastic_output)
+
+class Asks(MLPModel):
+    def forward(self, obs, *rest, **more):
+        action = super().forward(obs, *rest, **more)
+        return action + obs["extra"][..., :3] if "extra" in obs.keys() else action
+
+class Gets(MLPModel):
+    def forward(self, obs, *rest, **more):
+        extra = obs.get("extra", None)
+        return super().forward(obs, *rest, **more) + (0 if extra is None else extra[..., :3])
+"""
+GRU = {"rnn_type": "gru", "rnn_hidden_dim": 4, "rnn_num_layers": 1}
+OWN = {
+    "Begins": (GRU, "own_models.Begins does not begin an episode with a memory of zeros"),
+    "BeginsElsewhere": (GRU, "own_models.BeginsElsewhere does not begin an episode with a memory of zeros"),
+    "Asks": ({}, "own_models.Asks asks which observation groups there are"),
+    "Gets": ({}, "own_models.Gets asks for the observation group 'extra'"),
+}
+
+
+@pytest.fixture
+def own_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let classes of a user's own be imported."""
+    (tmp_path / "own_models.py").write_text(OWN_MODELS)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_models", raising=False)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_own_model_that_the_reference_would_not_see_through_is_refused(
+    name: str, own_models: None, tmp_path: Path
+) -> None:
+    options, words = OWN[name]
+    run = tmp_path / "run"
+    train(run, settings(class_name=f"own_models:{name}", **options), None, policy=OBSERVED, privileged=2, extra=3)
+    refuse(run, words, UnsupportedError)
+
+
+def test_own_model_is_exported_if_it_is_one_group_and_acts_as_its_graph(
+    own_models: None, tmp_path: Path, notices: list[str]
+) -> None:
+    runner = train(tmp_path / "run", settings(class_name="own_models:Mine"), None)
+    result, episodes = export(tmp_path / "run", notices), observations()
+    np.testing.assert_allclose(bundle_actions(result, episodes), raw_actions(runner, episodes), rtol=1e-5, atol=2e-6)
+    two = settings(class_name="own_models:Mine")
+    two["obs_groups"]["actor"] = ["policy", "privileged"]
+    train(tmp_path / "two" / "run", two, None)
+    refuse(tmp_path / "two" / "run", "which may treat the groups policy, privileged apart", UnsupportedError)
 
 
 # What Isaac Lab's own rules give for a robot whose joints are elbow, pan, lift (joint_actions.py and
