@@ -399,10 +399,10 @@ def _write_graphs(
     onnx = run_onnx(folder / ONNX_FILE)
     script = run_torchscript(folder / TORCHSCRIPT_FILE, graph.input_names, graph.output_names)
     progress(f"proving both against {framework}'s actions")
-    if reaching := reaching_batches(recipe, onnx, SEED):
-        references += record(restored.start_loop, reaching, framework)
-        comparer = comparer_of(restored, eager, references)
     try:
+        if reaching := reaching_batches(recipe, onnx, SEED):
+            references += record(restored.start_loop, reaching, framework)
+            comparer = comparer_of(restored, eager, references)
         runners = {"onnx": onnx, "torchscript": script}
         parity = prove(recipe, references, runners, labels, restored.reference or options.source.reference, comparer)
     except ParityError as error:

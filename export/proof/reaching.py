@@ -13,17 +13,19 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from rlservo.errors import ParityError
 from rlservo.export.proof.parity import GraphLoop
 from rlservo.export.recipe.recipe import Recipe
-from rlservo.export.recipe.runners import Outputs, Runner
+from rlservo.export.recipe.runners import Inputs, Outputs, Runner
 from rlservo.export.recipe.samples import Batch, draw_candidates
 
 
 def reaching_batches(recipe: Recipe, run: Runner, seed: int) -> list[Batch]:
     """Return the observations, or for a policy with a state the sequences, of each action element's extremes.
 
-    `run` runs the exported graph.
+    `run` runs the exported graph. Raises ParityError if it does not run on so many observations.
     """
+    run = _refusing(run)
     names = [name for name, space in recipe.action_leaves.items() if isinstance(space, Box)]
     if not names:
         return []
@@ -40,6 +42,19 @@ def reaching_batches(recipe: Recipe, run: Runner, seed: int) -> list[Batch]:
     for step, row in _extremes(np.stack(steps)):
         last[row] = max(step, last.get(row, 0))
     return [batch.row(row) for row, step in last.items() for batch in candidates[: step + 1]]
+
+
+def _refusing(run: Runner) -> Runner:
+    def run_or_refuse(inputs: Inputs) -> Outputs:
+        try:
+            return run(inputs)
+        except Exception as error:  # a shape baked into the graph ends in onnxruntime's own exceptions
+            rows = len(next(iter(inputs.values())))
+            raise ParityError(
+                f"onnx, a batch of {rows} observations: the exported graph does not run: {str(error).splitlines()[0]}"
+            ) from error
+
+    return run_or_refuse
 
 
 def _actions(outputs: Outputs, names: list[str]) -> NDArray[np.float64]:

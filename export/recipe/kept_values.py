@@ -6,6 +6,7 @@ arguments: class attributes, closures, defaults, and globals of its own modules.
 
 from __future__ import annotations
 
+import dis
 import functools
 import itertools
 import random
@@ -106,8 +107,9 @@ def _of_function(function: FunctionType, name: str, seen: set[int]) -> Iterator[
         yield from kept_values(inside, f"{name}.{key}", seen)
     for part in (function.__defaults__, function.__kwdefaults__, vars(function)):
         yield from kept_values(part, name, seen)
-    names = set(_names(function.__code__))
-    for key in sorted(names & function.__globals__.keys()):
+    used = set(_names(function.__code__))
+    names = {name for _, name in used}
+    for key in sorted({name for is_global, name in used if is_global} & function.__globals__.keys()):
         item, place = function.__globals__[key], f"{function.__module__}.{key}"
         if isinstance(item, ModuleType | FunctionType | type) and _is_anothers(item, function):
             continue
@@ -127,9 +129,11 @@ def _is_anothers(item: Any, function: FunctionType) -> bool:
     return top != str(function.__module__).partition(".")[0] and (is_installed or _is_of(top))
 
 
-def _names(code: CodeType) -> Iterator[str]:
-    """Yield the names of globals and attributes that a function and the functions in it use."""
-    yield from code.co_names
+def _names(code: CodeType) -> Iterator[tuple[bool, str]]:
+    """Yield whether it is a global, and the name, of the globals and attributes that a function and those in it use."""
+    for step in dis.get_instructions(code):
+        if step.opcode in dis.hasname:
+            yield step.opname.endswith(("_GLOBAL", "_NAME")), step.argval
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _names(constant)

@@ -144,7 +144,7 @@ def find_statistics(model: Path, data: Mapping[str, Any], given: Path | None, no
         notify("the model is exported without VecNormalize")
         return None
     if (statistics := given or statistics_beside(model)) is not None:
-        notify(f"the observations are normalized by {statistics}")
+        notify(f"VecNormalize is the one of {statistics}")
         return statistics
     if shows_vecnormalize(data):
         raise CheckpointError(

@@ -214,7 +214,7 @@ class Rule:
         elif isinstance(getattr(policy, "quantile_net", None), nn.Module):
             mode, names, scored_by = "argmax", (Q_VALUES,), "quantile_net"
         if distribution is None:
-            notify(f"the export of a {type(policy).__name__} on {space} cannot explore: only its own action is in it")
+            notify(f"a {type(policy).__name__} on {space} is exported without exploring actions")
         if value and recurrent:
             notify("the value head has a memory of its own, which predict does not carry: the export has no 'value'")
         elif value and hasattr(policy, "predict_values"):

@@ -27,7 +27,7 @@ def test_a_short_training_is_exported_served_and_driven_with(run_here: Callable[
     assert done.code == 0, done.err
     model = tmp_path / "runs" / "ur5-sb3"
     assert {file.name for file in model.iterdir()} == {"model.zip", "vecnormalize.pkl"}
-    assert f"the observations are normalized by {Path('runs')}" in done.out.replace(f"{tmp_path}/", "")
+    assert f"VecNormalize is the one of {Path('runs')}" in done.out.replace(f"{tmp_path}/", "")
     folder = tmp_path / "runs" / "policies"
     with Policy.load(folder / "ur5-sb3") as policy:
         assert policy.contract.provenance.source == "sb3" and policy.contract.provenance.env_steps == 8192

@@ -18,8 +18,8 @@ from rlservo.export.sources.leapp_description import StageTensor
 from rlservo.export.sources.onnx.onnx_tensors import Tensors
 from rlservo.policy.ort_session import open_ort_session
 
-TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(int64)": np.int64,
-         "tensor(int32)": np.int32, "tensor(bool)": np.bool_}  # fmt: skip
+TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16,
+         "tensor(int64)": np.int64, "tensor(int32)": np.int32, "tensor(bool)": np.bool_}  # fmt: skip
 
 
 def open_given(file: Path) -> Any:

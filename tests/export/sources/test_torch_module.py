@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 import rlservo
-from rlservo.errors import CheckpointError, RlservoError, UnsupportedError, UsageError
+from rlservo.errors import CheckpointError, ParityError, RlservoError, UnsupportedError, UsageError
 from rlservo.policy.policy import Policy
 
 torch = pytest.importorskip("torch")
@@ -264,6 +264,41 @@ def test_a_module_whose_copy_is_another_is_refused(tmp_path: Path, notices: list
     module.gain = -2.0
     with pytest.raises(UnsupportedError, match="has another 'gain' than itself"):
         rlservo.export_policy(module, SEEN, ARM, tmp_path / "out", name="x", notify=notices.append)
+
+
+class Renamed(nn.Module):
+    """Its part is called as a global of this file is, which it does not read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.attention = nn.TransformerEncoderLayer(3, 1, 8, batch_first=True, dropout=0.0)
+        self.layer = nn.Linear(3, 2)
+
+    def forward(self, obs: Any) -> Any:
+        return self.layer(self.attention(obs[:, None])[:, 0])
+
+
+def test_a_global_of_an_attributes_name_is_not_the_modules(
+    tmp_path: Path, notices: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = Renamed().eval()
+    monkeypatch.setitem(globals(), "attention", module)
+    rlservo.export_policy(module, SEEN, ARM, tmp_path / "out", name="x", notify=notices.append)
+
+
+class ShapeBakedIn(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Linear(3, 2)
+
+    def forward(self, obs: Any) -> Any:
+        return self.layer(torch.vmap(lambda row: torch.where(row.sum() > 0, row, -row))(obs))
+
+
+def test_a_graph_that_does_not_run_is_refused_with_the_reason(tmp_path: Path, notices: list[str]) -> None:
+    with pytest.raises(ParityError, match=r"a batch of \d+ observations: the exported graph does not run: "):
+        rlservo.export_policy(ShapeBakedIn(), SEEN, ARM, tmp_path / "out", name="x", notify=notices.append)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
