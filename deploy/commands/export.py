@@ -71,7 +71,10 @@ def export(
         float | None, typer.Option(min=1e-3, metavar="HZ", help="Control rate [Hz], if no file has it.")
     ] = None,
     action_range: Annotated[
-        str, typer.Option(metavar="LOW,HIGH", help="ONNX: bounds to clip every element of the action to.")
+        str,
+        typer.Option(
+            metavar="LOW,HIGH", help="ONNX: bounds to clip every element of the action to, after scale and offset."
+        ),
     ] = "",
     output: Annotated[
         list[str] | None,
