@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from rlservo.bundle.contract import Contract
 from rlservo.bundle.environment_id import NAMESPACE
-from rlservo.drive.make_environment import check_fit, check_proven, control_rate_of, make_env
+from rlservo.drive.environment_fit import check_fit, control_rate_of
+from rlservo.drive.make_environment import make_env
+from rlservo.drive.real_robot_gate import check_proven
 from rlservo.envs.randomization import DomainRandomization, wrapped_env
 from rlservo.envs.rendering import RenderedEnv, Start
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies

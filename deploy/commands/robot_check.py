@@ -58,7 +58,9 @@ def _bundle_problem(folder: Path, robot: str, model: str) -> str:
     """Return why the gate of real robots refuses a bundle; empty if it does not."""
     from rlservo.bundle.bundle import load_bundle
     from rlservo.bundle.environment_id import plain_id
-    from rlservo.drive.make_environment import check_fit, check_proven, make_env
+    from rlservo.drive.environment_fit import check_fit
+    from rlservo.drive.make_environment import make_env
+    from rlservo.drive.real_robot_gate import check_proven
     from rlservo.envs.randomization import wrapped_env
 
     contract = load_bundle(bundle_of(folder, None)).contract

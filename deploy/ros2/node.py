@@ -25,7 +25,9 @@ from rlservo.deploy.ros2.mapped_elements import (
     places,
 )
 from rlservo.drive.driven_episode import report_step
-from rlservo.drive.make_environment import check_fit, check_proven, make_env
+from rlservo.drive.environment_fit import check_fit
+from rlservo.drive.make_environment import make_env
+from rlservo.drive.real_robot_gate import check_proven
 from rlservo.errors import DeadlineError, RlservoError, UsageError
 from rlservo.policy.acting_policy import ActingPolicy
 from rlservo.robots.arm_interface import RobotError

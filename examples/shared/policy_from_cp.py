@@ -18,7 +18,8 @@ from gymnasium.spaces import Box, Space
 from numpy.typing import NDArray
 
 from rlservo import Policy, errors
-from rlservo.drive.make_environment import check_fit, make_env
+from rlservo.drive.environment_fit import check_fit
+from rlservo.drive.make_environment import make_env
 from rlservo.drive.success import success_of, success_rates
 from rlservo.export.sources.source import PICKLES
 from shared.help_text import DefaultsFormatter
@@ -87,7 +88,7 @@ def from_checkpoint(path: Path, app_dir: Path, env: Any) -> Act:
     from rlservo.export.checkpoints.location import locate_checkpoint
     from rlservo.export.checkpoints.unpickle import user_code
     from rlservo.export.recipe.recipe import leaf_transform
-    from rlservo.export.rllib.mean_std_filter import why_untrained
+    from rlservo.export.rllib.filter_statistics import why_untrained
     from rlservo.export.rllib.restore import restore
 
     files = locate_checkpoint(path, None)

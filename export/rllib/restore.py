@@ -10,7 +10,7 @@ from rlservo.export.checkpoints.location import Files
 from rlservo.export.checkpoints.old_location import OldStackFiles
 from rlservo.export.recipe.describe import unexpected_steps
 from rlservo.export.rllib import quick_import
-from rlservo.export.rllib.mean_std_filter import why_untrained
+from rlservo.export.rllib.filter_statistics import why_untrained
 from rlservo.export.rllib.supported_spaces import check_unsquashing
 from rlservo.export.sources.restored_policy import RestoredPolicy
 

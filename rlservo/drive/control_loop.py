@@ -18,8 +18,10 @@ import numpy as np
 from rlservo.bundle.contract import Contract
 from rlservo.drive.disturbance import disturb_env, parse_disturbance
 from rlservo.drive.driven_episode import DrivenEpisode, EpisodeEnv, report_step, run_episode
+from rlservo.drive.environment_fit import check_fit, control_rate_of
 from rlservo.drive.fallback import LinkCounts, StoppedError, WithFallback
-from rlservo.drive.make_environment import check_fit, check_proven, control_rate_of, make_env
+from rlservo.drive.make_environment import make_env
+from rlservo.drive.real_robot_gate import check_proven
 from rlservo.drive.report import ConnectionCounts, EpisodeRow, Rate, RolloutReport, latency_of
 from rlservo.drive.smoothness import MeasuredEnv
 from rlservo.drive.success import success_rates

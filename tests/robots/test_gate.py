@@ -16,7 +16,7 @@ from arms import LIMITS, RunningArm
 from rlservo.bundle.bundle import load_bundle
 from rlservo.bundle.contract import Evaluation
 from rlservo.drive.disturbance_table import evaluations_of, measure_disturbances
-from rlservo.drive.make_environment import check_proven
+from rlservo.drive.real_robot_gate import check_proven
 from rlservo.errors import UsageError
 from rlservo.policy.policy import Policy
 

@@ -28,7 +28,7 @@ from rlservo.export.recipe.recipe import (
 )
 from rlservo.export.recipe.trees import space_leaves
 from rlservo.export.rllib import private_names
-from rlservo.export.rllib.mean_std_filter import frozen_filter
+from rlservo.export.rllib.filter_statistics import frozen_filter
 
 # Pieces that move data about without changing a number.
 PLUMBING = frozenset({

@@ -15,7 +15,7 @@ from rlservo.errors import UnsupportedError
 from rlservo.export.recipe.recipe import ObservationStep, Preprocess, Transform, leaf_transform
 from rlservo.export.recipe.trees import space_leaves
 from rlservo.export.rllib import private_names
-from rlservo.export.rllib.mean_std_filter import frozen_filter
+from rlservo.export.rllib.filter_statistics import frozen_filter
 
 # Agent connectors that change no number of a stateless policy's observation, and action connectors likewise.
 AGENT_PLUMBING = frozenset({"ClipRewardAgentConnector", "StateBufferConnector", "ViewRequirementAgentConnector"})
