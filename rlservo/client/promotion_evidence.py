@@ -58,7 +58,7 @@ def read_metrics(text: str, policy: str) -> dict[str, Numbers]:
         for name, labels, value, *_ in (sample for family in families for sample in family.samples):
             if name in READ and (name in (PLAN, UPTIME, START, LOST) or labels["policy"] == policy):
                 line = (name, *sorted(labels.items()))
-                if not 0 <= value < math.inf or not float(labels.get("le", 0)) >= 0 or line in lines:
+                if not 0 <= value < math.inf or not float(labels.get("le", 0)) >= 0 or "" in labels or line in lines:
                     raise UntrustedError(f"{name} {labels} is {value}, or there twice")
                 lines.add(line)
                 numbers = processes.setdefault(labels.get("replica", ""), {})
