@@ -112,6 +112,8 @@ def configurations() -> dict[str, Any]:
     flat = FlattenObservations
     return {
         "asymmetric": ppo("privileged", "box", module=zoo_reported.Asymmetric),
+        "trains_otherwise": ppo("vector", "discrete", module=zoo_reported.TrainsOtherwise),
+        "critic_in_training": ppo("vector", "discrete", module=zoo_reported.NeedsItsCritic),
         "partly_read": ppo("partly_read", "discrete", module=zoo_reported.PartReader),
         "removed_key": ppo("privileged", "box", without_critic),
         "in_order": ppo("unsorted", "discrete", module=zoo_reported.InOrder),

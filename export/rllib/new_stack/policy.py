@@ -154,10 +154,12 @@ class NewStackLoop:
     It begins with new episodes and connectors that remember nothing.
     """
 
-    def __init__(self, pipelines: Pipelines, recipe: Recipe, network: RLModuleNetwork) -> None:
+    def __init__(self, pipelines: Pipelines, recipe: Recipe, network: RLModuleNetwork, whole: Any) -> None:
+        """`whole` is the module with what only training needs, such as the value head."""
         self.pipelines = pipelines.fresh()
         self._recipe = recipe
         self._network = network
+        self._whole = whole
         self._shared: dict[str, Any] = {}
         self._episodes: list[Any] = []
         self._last: list[tuple[Any, dict[str, Any]]] = []
@@ -207,7 +209,7 @@ class NewStackLoop:
 
     def _outputs(self, batch: dict[str, Any], forward: dict[str, Any]) -> Outputs:
         """Return the network's outputs: those of the forward pass, copied, and those that take a pass of their own."""
-        module, stateful = self.pipelines.module, self._network.state is not None
+        module, stateful = self._whole, self._network.state is not None
         outputs: Outputs = {}
         with torch.no_grad():
             for name in self._network.names:
@@ -260,7 +262,16 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     pipelines = pipelines_of(slot, module, env_to_module, module_to_env, observation_space, action_space)
     # The output of the module's forward pass decides the rule, and running it takes observations.
     draft = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
-    distribution, mode, names = _action_rule(module, _forward_once(pipelines, draft), action_space, notify)
+    forward = _forward_once(pipelines, draft)
+    actor = _actor(files, module, notify)
+    reference = pipelines_of(slot, actor, *own, observation_space, action_space)
+    if _acts_alike(forward, _forward_once(pipelines, draft)) and not _acts_alike(
+        forward, _forward_once(reference, draft)
+    ):
+        raise UnsupportedError(
+            f"module {name} acts otherwise when it is built for inference only, as RLlib's actors are: not exported"
+        )
+    distribution, mode, names = _action_rule(module, forward, action_space, notify)
     recipe = dataclasses.replace(draft, mode=mode, distribution=distribution)
     if value and isinstance(module, ValueFunctionAPI):
         if no_value:
@@ -272,8 +283,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
     network = RLModuleNetwork(traced, names, acts=mode == "given", rule=rule)
     module_class = f"{type(module).__module__}.{name}"
-    reference = pipelines_of(slot, module, *own, observation_space, action_space)
-    start_loop = partial(NewStackLoop, reference, recipe, network)
+    start_loop = partial(NewStackLoop, reference, recipe, network, module)
     return RestoredPolicy(recipe, network, module_class, start_loop, slot.agents, reference=how)
 
 
@@ -322,6 +332,37 @@ def _read_pipelines(
             with _explained(folder):
                 set_saved_state(pipeline, folder)
     return pipelines
+
+
+def _actor(files: CheckpointFiles, module: Any, notify: Callable[[str], None]) -> Any:
+    """Return the module as RLlib's actors build it: for inference only, with the weights that this needs."""
+    if files.alone or module.inference_only or is_older(files.module):
+        return module
+    try:
+        with torch.random.fork_rng():
+            args, given = module.get_ctor_args_and_kwargs()
+            actor = type(module)(*args, **{**given, "inference_only": True})
+        actor.set_state(module.get_state(inference_only=True))
+    except Exception as error:  # the user's own constructor and state may raise anything
+        notify(
+            f"module {type(module).__name__} cannot be built for inference only, as RLlib's actors build it "
+            f"({first_line(error)}): the actions are those of the whole module"
+        )
+        return module
+    return actor.eval().requires_grad_(False)
+
+
+def _acts_alike(one: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Return whether two forward passes give the same actions and states, but for rounding."""
+    names = (Columns.ACTIONS, Columns.ACTION_DIST_INPUTS, Columns.STATE_OUT)
+    leaves = [
+        [torch.as_tensor(leaf) for name in names if name in given for leaf in tree_leaves(given[name])]
+        for given in (one, other)
+    ]
+    return len(leaves[0]) == len(leaves[1]) and all(
+        mine.shape == theirs.shape and torch.allclose(mine.double(), theirs.double(), 1e-4, 1e-5, equal_nan=True)
+        for mine, theirs in zip(*leaves, strict=True)
+    )
 
 
 def _second_module(module: Any, files: CheckpointFiles) -> Any:

@@ -58,10 +58,19 @@ def assert_acts_as_recorded(result: ExportResult, file: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["asymmetric", "partly_read", "removed_key", "infinite_buffers", "image_lstm", "unusual", "uint32"]
-)
+    "name",
+    [
+        "asymmetric", "critic_in_training", "partly_read", "removed_key", "infinite_buffers", "image_lstm", "unusual",
+        "uint32",
+    ],
+)  # fmt: skip
 def test_the_export_acts_as_rllib_did(reported_zoo: Path, export: Callable[..., ExportResult], name: str) -> None:
     assert_acts_as_recorded(export(name, value=name != "asymmetric"), reported_zoo / f"{name}.npz")
+
+
+def test_a_module_that_acts_otherwise_in_rllibs_actors_is_refused(export: Callable[..., ExportResult]) -> None:
+    with pytest.raises(UnsupportedError, match="TrainsOtherwise acts otherwise when it is built for inference only"):
+        export("trains_otherwise")
 
 
 def test_a_network_that_reads_parts_in_their_order_is_given_rllibs(

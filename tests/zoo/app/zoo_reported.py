@@ -76,6 +76,32 @@ class Asymmetric(TorchRLModule, ValueFunctionAPI):
         return self.values(torch.cat((obs["actor"], obs["critic"]), dim=-1)).squeeze(-1)
 
 
+class TrainsOtherwise(TorchRLModule, ValueFunctionAPI):
+    """Acts otherwise where RLlib builds it for inference only: in its actors."""
+
+    def setup(self) -> None:
+        self.policy, self.values = nn.Linear(3, 4), nn.Linear(3, 1)
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        logits = self.policy(batch[Columns.OBS])
+        return {Columns.ACTION_DIST_INPUTS: -logits if self.inference_only else logits}
+
+    def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
+        return self.values(batch[Columns.OBS]).squeeze(-1)
+
+
+class NeedsItsCritic(TrainsOtherwise):
+    """Acts the same, but has its critic only where RLlib trains."""
+
+    def setup(self) -> None:
+        self.policy = nn.Linear(3, 4)
+        if not self.inference_only:
+            self.values = nn.Linear(3, 1)
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        return {Columns.ACTION_DIST_INPUTS: self.policy(batch[Columns.OBS])}
+
+
 class PartReader(TorchRLModule, ValueFunctionAPI):
     """Reads one part of a Dict and one of a Tuple."""
 
