@@ -101,7 +101,8 @@ def _restore(file: Path, agent_file: Path, joint_order: tuple[str, ...], notify:
     from rlservo.export.sources.torch_policy import TorchPolicy, restored
 
     config = read_yaml(agent_file)
-    layout = _layout(file, agent_file, config, load_weights(file))
+    weights = load_weights(file)
+    layout = _layout(file, agent_file, config, weights)
     agent = _agent(file, config, layout)
     environment = agent_file.with_name("env.yaml")
     terms = ActionTerms()
@@ -110,6 +111,10 @@ def _restore(file: Path, agent_file: Path, joint_order: tuple[str, ...], notify:
     for note in terms.notes:
         notify(note)
     frozen = _filter(file, agent)
+    if frozen is None and weights.get("observation_preprocessor"):
+        raise CheckpointError(
+            f"{file} has an observation_preprocessor, and {agent_file} names none: they do not belong together"
+        )
     low, high = terms.bounds or (-np.inf, np.inf)
     action_space = Box(low, high, (layout.actions,), np.float32) if layout.choices is None else Discrete(layout.actions)
     recipe = Recipe(

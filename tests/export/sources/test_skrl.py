@@ -304,6 +304,15 @@ def test_a_recurrent_agent_forgets_where_an_episode_starts(cell: str, tmp_path: 
     assert not np.allclose(found[0], found[len(obs) // 2]), "the memory did not matter"
 
 
+def test_a_scaler_that_the_settings_do_not_name_is_refused(tmp_path: Path) -> None:
+    """It was left out: the run's two files contradict each other."""
+    settings = config()
+    train(tmp_path / "run", settings, Box(-1, 1, (2,), np.float32))
+    settings["agent"]["observation_preprocessor"] = None
+    (tmp_path / "run" / "params" / "agent.yaml").write_text(yaml.dump(settings))
+    refuse(tmp_path / "run", "has an observation_preprocessor, and .*agent.yaml names none: they do not belong")
+
+
 def test_runs_that_cannot_be_read_are_refused_with_the_reason(tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(run, config(), Box(-1, 1, (2,), np.float32))
