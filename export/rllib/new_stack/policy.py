@@ -264,10 +264,9 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     draft = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
     forward = _forward_once(pipelines, draft)
     actor = _actor(files, module, notify)
-    reference = pipelines_of(slot, actor, *own, observation_space, action_space)
-    if _acts_alike(forward, _forward_once(pipelines, draft)) and not _acts_alike(
-        forward, _forward_once(reference, draft)
-    ):
+    acting = pipelines_of(slot, actor, env_to_module, module_to_env, observation_space, action_space)
+    is_repeatable = _acts_alike(forward, _forward_once(pipelines, draft))  # else the gate says so
+    if is_repeatable and not _acts_alike(forward, _forward_once(acting, draft)):
         raise UnsupportedError(
             f"module {name} acts otherwise when it is built for inference only, as RLlib's actors are: not exported"
         )
@@ -283,6 +282,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     rule = _deterministic(module) if Columns.ACTION_DIST_INPUTS in names else None
     network = RLModuleNetwork(traced, names, acts=mode == "given", rule=rule)
     module_class = f"{type(module).__module__}.{name}"
+    reference = pipelines_of(slot, actor, *own, observation_space, action_space)
     start_loop = partial(NewStackLoop, reference, recipe, network, module)
     return RestoredPolicy(recipe, network, module_class, start_loop, slot.agents, reference=how)
 
