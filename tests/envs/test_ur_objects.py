@@ -249,5 +249,5 @@ def test_payload_taken_off_leaves_no_trace() -> None:
             sim.command(START + 0.3)
             sim.advance()
     assert (plain.joint_positions == loaded.joint_positions).all()
-    with pytest.raises(ValueError, match="the payload is 21 kg: expected 0 to 20 kg"):
-        loaded.set_payload(21.0)
+    with pytest.raises(ValueError, match="the payload is 36 kg: expected 0 to 35 kg"):
+        loaded.set_payload(36.0)

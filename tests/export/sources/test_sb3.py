@@ -130,7 +130,7 @@ def test_state_dependent_exploration_that_squashes_is_unscaled(tmp_path: Path, n
     result = export_checkpoint(tmp_path / "model.zip", tmp_path / "out", notify=notices.append)
     seen = samples(VECTOR, 6)
     same(episodes(result, seen), [model.predict(obs, deterministic=True)[0] for episode in seen for obs in episode])
-    assert "cannot explore" in " ".join(notices)
+    assert "is exported without exploring actions" in " ".join(notices)
 
 
 @pytest.mark.parametrize("action", [ONE, SEVERAL, BITS], ids=["one", "several", "bits"])
