@@ -335,8 +335,11 @@ def _read_pipelines(
 
 
 def _actor(files: CheckpointFiles, module: Any, notify: Callable[[str], None]) -> Any:
-    """Return the module as RLlib's actors build it: for inference only, with the weights that this needs."""
-    if files.alone or module.inference_only or is_older(files.module):
+    """Return the module as RLlib's actors build it: for inference only, with the weights that this needs.
+
+    A module that another Ray wrote is returned as it is: its parts may have other names there.
+    """
+    if files.alone or module.inference_only or _other_ray(files.module):
         return module
     try:
         with torch.random.fork_rng():
