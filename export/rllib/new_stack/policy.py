@@ -335,17 +335,17 @@ def _read_pipelines(
 
 
 def _actor(files: CheckpointFiles, module: Any, notify: Callable[[str], None]) -> Any:
-    """Return the module as RLlib's actors build it: for inference only, with the weights that this needs.
+    """Return the module as RLlib's actors build it, for inference only.
 
-    A module that another Ray wrote is returned as it is: its parts may have other names there.
+    It gets all weights: a critic's memory, which it may have, is compared too.
     """
-    if files.alone or module.inference_only or _other_ray(files.module):
+    if files.alone or module.inference_only or is_older(files.module):
         return module
     try:
         with torch.random.fork_rng():
             args, given = module.get_ctor_args_and_kwargs()
             actor = type(module)(*args, **{**given, "inference_only": True})
-        actor.set_state(module.get_state(inference_only=True))
+        actor.set_state(module.get_state())
     except Exception as error:  # the user's own constructor and state may raise anything
         notify(
             f"module {type(module).__name__} cannot be built for inference only, as RLlib's actors build it "
