@@ -26,6 +26,7 @@ from typing import Any
 import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.supervisors import Multiprocess
+from uvicorn.supervisors.multiprocess import Process
 
 from rlservo.client.formats.addresses import is_loopback
 from rlservo.client.formats.admin_key_file import remove_key, written_key
@@ -223,6 +224,8 @@ class EmbeddedServer:
         state[HANDLER] = app.handler
         left_out = await not_served(control) if self.on_ready is not None else []
         self.app = app
+        if is_worker:
+            _started(os.getpid()).touch()
         if self.on_ready is not None:
             self.on_ready(store, left_out)
 
@@ -302,6 +305,15 @@ def _run_workers(
         raise UnavailableError("a worker could not start: see the lines above")
 
 
+def _started(pid: int | None) -> Path:
+    """Return the file that a worker makes when it answers requests.
+
+    uvicorn's own question, `Process.is_ready`, may never be answered: in a worker two threads make `Process.server`
+    when they first need it, and if both do, it asks the one that does not run (0.54; one start in forty beside load).
+    """
+    return Path(os.environ[FOLDER_VARIABLE], f"{pid}.started")
+
+
 class _Supervisor(Multiprocess):
     """uvicorn's supervisor, which reports when all workers are ready and kills those that do not exit."""
 
@@ -334,9 +346,26 @@ class _Supervisor(Multiprocess):
         for process, code in before:
             if process not in self.processes and process.pid is not None:
                 _log_death(process.pid, code, process.exitcode, left.get(process.pid, []))
-        if self._on_ready is not None and all(process.is_ready() for process in self.processes):
+        if self._on_ready is not None and all(_started(process.pid).exists() for process in self.processes):
             self._on_ready()
             self._on_ready = None
+
+    def restart_all(self) -> None:
+        """Replace each worker, the next one when the new one answers requests, unless one does not start."""
+        for index, old in enumerate(self.processes):
+            new = Process(self.config, self.sockets)
+            new.start()
+            while not _started(new.pid).exists():
+                if new.exitcode is not None or self._is_told_to_stop():
+                    new.kill()
+                    new.join()
+                    if not self._is_told_to_stop():
+                        logger.error("new worker %s could not start: worker %s stays", new.pid, old.pid)
+                    return
+                time.sleep(0.1)
+            self.processes[index] = new
+            old.terminate()
+            old.join()
 
     def handle_term(self) -> None:
         """Stop on SIGTERM, and on Ctrl-C."""
@@ -365,6 +394,9 @@ class _Supervisor(Multiprocess):
         """Queue a signal; a health check in progress would wait for a worker that is stopped."""
         self.signal_queue.append(number)
         self._continue_all()
+
+    def _is_told_to_stop(self) -> bool:
+        return not {signal.SIGINT, signal.SIGTERM}.isdisjoint(self.signal_queue)
 
     def _continue_all(self) -> None:
         for process in self.processes:

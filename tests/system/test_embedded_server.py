@@ -6,10 +6,12 @@ import contextlib
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -191,6 +193,53 @@ def test_sighup_replaces_every_worker_and_no_request_fails(workers: tuple[Run, L
         wait_for(lambda: not set(before) & set(now := worker_pids(run)) and len(now) == 2, poll_s=0.2)
         time.sleep(1)
     assert load.asked > 100 and (load.wrong, load.failures) == (0, [])
+
+
+# uvicorn 0.54 makes a worker's server twice if its two threads come to it at once; the one that it asks whether it has
+# started is then not the one that runs, here every time.
+ASKED_THE_WRONG_ONE = """
+import uvicorn
+from uvicorn.supervisors.multiprocess import Process
+
+Process.server = property(lambda self: uvicorn.Server(self.config))
+
+if __name__ == "__main__":
+    from rlservo.deploy.cli import main
+
+    main()
+"""
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_workers_say_themselves_that_they_have_started(policies: Path, tmp_path: Path) -> None:
+    script = tmp_path / "serve.py"
+    script.write_text(ASKED_THE_WRONG_ONE)
+    (port,) = free_ports(1)
+    command = [sys.executable, str(script), "serve", str(policies), "--port", str(port), "--workers", "2"]
+    with running(command, port) as run:
+        lines: list[str] = []
+        threading.Thread(target=lines.extend, args=(run.process.stdout,), daemon=True).start()
+        wait_for(lambda: any(line.startswith("ready") for line in lines), "the line that it is ready")
+        before = worker_pids(run)
+        run.process.send_signal(signal.SIGHUP)
+        wait_for(lambda: not set(before) & set(now := worker_pids(run)) and len(now) == 2, "new workers", poll_s=0.2)
+        assert run.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_sighup_keeps_workers_that_new_ones_cannot_replace(box_policy: Callable[..., Path], tmp_path: Path) -> None:
+    box_policy(tmp_path / "policies")
+    with launched(tmp_path / "policies", workers=2) as run:
+        run.wait_until_ready()
+        before = worker_pids(run)
+        shutil.rmtree(tmp_path / "policies")
+        run.process.send_signal(signal.SIGHUP)
+        wait_for(lambda: "could not start: worker" in "".join(run.output), "the sentence that it stays")
+        assert worker_pids(run) == before
+        assert ask(run.port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200
+        assert run.end(signal.SIGTERM) == 0
 
 
 @pytest.mark.serve
