@@ -332,8 +332,8 @@ def _check_filter(files: PolicyFiles, facts: CheckpointFacts, restored: Restored
         options.notify(f"{why}; {trained}")
     elif frozen is not None and steps is not None and frozen.count < steps / 2:
         options.notify(
-            f"the observation filter's statistics come from {frozen.count:,} observations; {trained}: the env "
-            "runners that acted in training had seen more than the checkpoint holds"
+            f"the observation filter's statistics come from {frozen.count:,} observations; {trained}: what "
+            "acted in training had seen more than the checkpoint holds"
         )
 
 

@@ -113,7 +113,7 @@ def _summary(contract: Contract) -> Table:
 
 def _exploration(contract: Contract) -> str:
     if contract.distribution is None:
-        return "nothing: this policy has no action distribution"
+        return "nothing: this bundle has no action distribution"
     transform = {"none": "", "unsquash": ", then unsquashed and clipped", "clip": ", then clipped"}
     kind = contract.distribution.kind.replace("_", " ")
     if contract.distribution.kind == "multi":

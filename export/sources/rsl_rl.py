@@ -43,7 +43,7 @@ class RslRl(Source):
     expects = "rsl_rl's model_*.pt with params/agent.yaml beside it, or that folder"
     reference = (
         "the policy of rsl_rl's own runner, restored by runner.load: get_inference_policy() with its normalizer and "
-        "memory; then process_actions of the environment's action terms, as Isaac Lab computes it"
+        "memory; with an env.yaml, then its action terms' process_actions, as Isaac Lab computes it"
     )
     options = ("--joint-order",)
 

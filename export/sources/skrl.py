@@ -47,7 +47,7 @@ class Skrl(Source):
     expects = "skrl's agent_*.pt of a run with params/agent.yaml, or the run's folder"
     reference = (
         "skrl's own agent, restored by its runner and agent.load: agent.act with its preprocessor, the mean action or "
-        "the likeliest choice; then process_actions of the environment's action terms, as Isaac Lab computes it"
+        "the likeliest choice; with an env.yaml, then its action terms' process_actions, as Isaac Lab computes it"
     )
     options = ("--joint-order",)
 
@@ -69,9 +69,14 @@ class Skrl(Source):
         from rlservo.export.sources.isaac_env import read_yaml, section
 
         found = find_run(files.root)
-        agent = section(read_yaml(found[1]), "agent", found[1]) if found else {}
-        match = _AGENT.fullmatch(files.root.name)
-        return CheckpointFacts(str(agent.get("class") or "unknown"), env_steps=int(match[1]) if match else None)
+        assert found is not None, "locate has found it"
+        agent = section(read_yaml(found[1]), "agent", found[1])
+        match, environment = _AGENT.fullmatch(files.root.name), found[1].with_name("env.yaml")
+        steps = None
+        if match and environment.is_file():  # the number in the name counts steps of all environments at once
+            count = section(read_yaml(environment), "scene", environment).get("num_envs")
+            steps = int(match[1]) * count if isinstance(count, int) else None
+        return CheckpointFacts(str(agent.get("class") or "unknown"), env_steps=steps)
 
     def restore(self, files: PolicyFiles, options: RestoreOptions, notify: Notify) -> RestoredPolicy:
         found = find_run(files.root)
@@ -110,6 +115,9 @@ def _restore(file: Path, agent_file: Path, joint_order: tuple[str, ...], notify:
         terms = action_terms(environment, layout.actions, None, joint_order)
     for note in terms.notes:
         notify(note)
+    best = file.with_name("best_agent.pt")
+    if _AGENT.fullmatch(file.name) and best.is_file():
+        notify(f"this is {file.name}; to export the weights with the best return, give {best}")
     frozen = _filter(file, agent)
     if frozen is None and weights.get("observation_preprocessor"):
         raise CheckpointError(

@@ -122,7 +122,7 @@ def test_the_scaler_and_the_environments_scale_are_baked_in(tmp_path: Path, noti
     env = {"sim": {"dt": 0.01}, "decimation": 2, "actions": {"arm": {
         "class_type": "isaaclab.envs.mdp.actions.joint_actions:JointVelocityAction", "joint_names": ["pan", "lift"],
         "scale": {"lift": 2.0, "pan": 0.5}, "offset": 0.0, "use_default_offset": True, "clip": {"pan": [-0.1, 0.1]}}},
-        "scene": {"robot": {"init_state": {"joint_vel": {"lift": 0.3}}}}}  # fmt: skip
+        "scene": {"num_envs": 64, "robot": {"init_state": {"joint_vel": {"lift": 0.3}}}}}  # fmt: skip
     (tmp_path / "run" / "params" / "env.yaml").write_text(yaml.dump(env, sort_keys=False))
     refuse(tmp_path / "run", "in the robot's own order, which no file of the run has")
     result = export_checkpoint(
@@ -142,7 +142,7 @@ def test_the_scaler_and_the_environments_scale_are_baked_in(tmp_path: Path, noti
         agent.checkpoint_modules["observation_preprocessor"].current_count
     )
     assert [(e.name, e.unit) for e in contract.action_space.elements] == [("lift", "rad/s"), ("pan", "rad/s")]
-    assert (contract.provenance.algorithm, contract.provenance.env_steps) == ("PPO", 500)
+    assert (contract.provenance.algorithm, contract.provenance.env_steps) == ("PPO", 500 * 64)
     assert "expressions that skrl evaluates" in notices[0]
 
 
@@ -167,9 +167,12 @@ def test_a_categorical_policy_takes_the_likeliest_choice_and_explores_as_the_age
     if normalized:  # the model gives probabilities, to any sum
         settings["models"]["policy"] |= {"unnormalized_log_prob": False, "output": "3 * sigmoid(ACTIONS)"}
     agent = train(tmp_path / "run", settings, Discrete(3))
+    (tmp_path / "run" / "checkpoints" / "best_agent.pt").touch()
     result = export_checkpoint(
         tmp_path / "run" / "checkpoints" / "agent_500.pt", tmp_path / "out", name="chooser", notify=notices.append
     )
+    assert any("this is agent_500.pt" in notice and "best_agent.pt" in notice for notice in notices)
+    assert result.contract.provenance.env_steps is None  # without env.yaml the number of environments is unknown
     obs = observations()
     with torch.no_grad():
         agent.act(obs, None, timestep=0, timesteps=0)
