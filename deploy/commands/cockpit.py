@@ -44,7 +44,7 @@ def cockpit(
         Path | None, typer.Option(help="Record the episodes, and who drives, into a new .mcap file or a folder.")
     ] = None,
     unproven: Annotated[
-        bool, typer.Option("--unproven", help="Real robot: accept a policy without an evaluation under latency.")
+        bool, typer.Option("--unproven", help="Real robot: accept a policy that was not proven under latency.")
     ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page on 127.0.0.1.")] = PORT,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the first episode.")] = None,

@@ -85,7 +85,7 @@ def rollout(
         typer.Option("--dry-run", help="Real arm: show start, path, speeds and end of one episode; nothing moves."),
     ] = False,
     unproven: Annotated[
-        bool, typer.Option("--unproven", help="Real robot: accept a policy without an evaluation under latency.")
+        bool, typer.Option("--unproven", help="Real robot: accept a policy that was not proven under latency.")
     ] = False,
     as_json: Json = False,
 ) -> None:

@@ -51,7 +51,7 @@ def ros2(
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Record into a new .mcap file or a folder.")] = None,
     unproven: Annotated[
-        bool, typer.Option("--unproven", help="Accept a policy that was never evaluated under latency.")
+        bool, typer.Option("--unproven", help="Accept a policy that was not proven under latency.")
     ] = False,
     ros_args: Annotated[
         list[str] | None, typer.Argument(metavar="--ros-args ...", help="Remappings and parameters, as for any node.")

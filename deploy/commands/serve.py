@@ -181,7 +181,7 @@ def _load_config(file: Path) -> dict[str, Any]:
     except ValueError as error:
         raise UsageError(f"{file} cannot be read: {' '.join(str(error).split())[:300]}") from None
     if not isinstance(document, dict) or not isinstance(document.get("policies", {}), dict):
-        raise UsageError(f"{file}: expected a map with 'policies', like user_config in deploy/serve.yaml")
+        raise UsageError(f"{file}: expected a map whose 'policies' is a map, like user_config in deploy/serve.yaml")
     return document
 
 

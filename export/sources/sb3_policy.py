@@ -41,6 +41,7 @@ OBSERVATIONS, ACTION_MASK = "observations", "action_mask"
 ACTING = ("predict", "_predict", "obs_to_tensor", "unscale_action")
 """Methods through which predict passes around a policy's networks; `forward` is one of them if nothing else acts."""
 LIBRARIES = ("stable_baselines3", "sb3_contrib")
+EXPORTED = "expected Box, Discrete, MultiDiscrete or MultiBinary"
 MASKED = torch.finfo(torch.float32).min
 
 
@@ -433,8 +434,10 @@ def _check_spaces(file: Path, observation_space: Any, action_space: Any) -> None
     """Raise UnsupportedError for spaces that have no fixed shape or no tensors."""
     for key, space in _leaves(observation_space).items():
         if not isinstance(space, Box | Discrete | MultiDiscrete | MultiBinary):
-            raise UnsupportedError(f"{file}: {_leaf(key)}: the observation space {space} is not exported")
+            raise UnsupportedError(f"{file}: {_leaf(key)}: the observation space {space} is not exported: {EXPORTED}")
     if not isinstance(action_space, Box | Discrete | MultiDiscrete | MultiBinary):
-        raise UnsupportedError(f"{file}: the action space {action_space} is not exported")
+        raise UnsupportedError(f"{file}: the action space {action_space} is not exported: {EXPORTED}")
     if isinstance(action_space, Box) and action_space.dtype not in (np.float32, np.float64):
-        raise UnsupportedError(f"{file}: the action space {action_space} is not exported: only float Boxes are")
+        raise UnsupportedError(
+            f"{file}: the action space {action_space} is not exported: of Boxes, only float ones are"
+        )

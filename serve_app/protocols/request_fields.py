@@ -101,7 +101,10 @@ def parse_fields(kind: TypeAdapter[Any], document: Mapping[Any, Any], what: str 
     if first["type"] == "extra_forbidden":
         raise RequestError(f"unknown {what} '{place}': leave it out")
     expected = EXPECTED.get(first["type"]) or first["msg"].partition(" should ")[2] or first["msg"]
-    raise RequestError(f"'{place}' must {expected}, got {json_type(first['input'])}")
+    got = "" if first["type"] == "missing" else f", got {json_type(first['input'])}"
+    if first["type"] in ("string_too_short", "string_too_long"):
+        got = f", got {len(first['input'])}"
+    raise RequestError(f"'{place}' must {expected}{got}")
 
 
 def _is_usual(obs: Any = None, seq: Any = 0, deadline_ms: Any = 0.0) -> bool:  # noqa: ARG001

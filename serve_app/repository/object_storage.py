@@ -98,7 +98,7 @@ class ObjectStorage:
             self._succeeded(self._call("list_objects_v2", folder, given, into=page, most=PAGE), folder)
             text = page.getvalue().decode(errors="replace")
             if "<ListBucketResult" not in text:
-                raise UnavailableError(f"{self.uri}/{folder}: the storage did not send a list of objects")
+                raise UnavailableError(f"{self.uri}/{folder}: no list of objects came: check AWS_ENDPOINT_URL")
             found += [key.removeprefix(prefix) for key in re.findall(r"<Key>([^<]+)</Key>", text)]
             if "<IsTruncated>true" not in text:
                 return found

@@ -122,7 +122,8 @@ class Keys:
             keys.append(Key(match["label"], Role(match["role"]), bytes.fromhex(match["digest"]), limit))
         if (settings.api_keys_file is not None or settings.api_keys.strip()) and not keys:
             raise UsageError(
-                "the key settings hold no key and would leave the server open: add a key, or remove the settings"
+                "RLSERVO_API_KEYS and RLSERVO_API_KEYS_FILE hold no key and would leave the server open: add a key, or "
+                "remove them"
             )
         digest = settings.operator_key.removeprefix("sha256:")
         return cls(tuple(keys), Key("operator", Role.admin, bytes.fromhex(digest)) if digest else None)

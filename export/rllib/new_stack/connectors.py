@@ -181,7 +181,9 @@ def _flatten(piece: Any, space: Any) -> Flatten:
                 f"{name}: RLlib's own FlattenObservations cannot encode {leaf}, whose values do not start at 0"
             )
         if isinstance(leaf, MultiDiscrete) and leaf.nvec.ndim != 1:
-            raise UnsupportedError(f"{name}: RLlib's own FlattenObservations cannot encode {leaf}, which is a grid")
+            raise UnsupportedError(
+                f"{name}: RLlib's own FlattenObservations cannot encode {leaf}, which is not one-dimensional"
+            )
     removed = private_names.get(piece, "_keys_to_remove") if isinstance(space, Dict) else None
     without = tuple(removed or ())
     # A Box needs no further detail, which keeps the contract short.

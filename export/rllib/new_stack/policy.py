@@ -268,7 +268,8 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     is_repeatable = _acts_alike(forward, _forward_once(pipelines, draft))  # else the gate says so
     if is_repeatable and not _acts_alike(forward, _forward_once(acting, draft)):
         raise UnsupportedError(
-            f"module {name} acts otherwise when it is built for inference only, as RLlib's actors are: not exported"
+            f"module {name} acts differently when it is built for inference only, as RLlib's actors build it: make "
+            "both act alike"
         )
     distribution, mode, names = _action_rule(module, forward, action_space, notify)
     recipe = dataclasses.replace(draft, mode=mode, distribution=distribution)

@@ -85,8 +85,8 @@ def _find_class(part: _Part, name: str, app_dir: Path) -> Any:
         if isinstance(kind, type) and issubclass(kind, part.kind):
             return kind
         reason = reason or CheckpointError(
-            f"the custom {part.called} '{name}' is {found.module}.{found.attribute}, which is not a torch one "
-            f"({part.kind.__name__})"
+            f"the custom {part.called} '{name}' is {found.module}.{found.attribute}, which is not a "
+            f"{part.kind.__name__}"
         )
     raise reason or CheckpointError(
         f"the checkpoint names its custom {part.called} '{name}' but does not hold the class: looked in the Python "

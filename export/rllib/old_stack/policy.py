@@ -234,9 +234,8 @@ def _check_config(files: OldStackFiles, policy_class: Any, config: Mapping[str, 
         )
     if any(config.get(setting) is True for setting in MIXTURES):
         raise UnsupportedError(
-            f"{files.root} holds an RLModule inside an old-stack policy ({name}), a mixture that today's Ray cannot "
-            "restore, and not one of RLlib's own for vectors without memory, which the export takes for the same "
-            "network of the old stack: train again with a later Ray"
+            f"{files.root} holds an RLModule inside an old-stack policy ({name}), which today's Ray cannot restore; of "
+            "these, only RLlib's own for vectors without memory are exported: train again with a later Ray"
         )
 
 

@@ -69,7 +69,7 @@ def test_the_export_acts_as_rllib_did(reported_zoo: Path, export: Callable[..., 
 
 
 def test_a_module_that_acts_otherwise_in_rllibs_actors_is_refused(export: Callable[..., ExportResult]) -> None:
-    with pytest.raises(UnsupportedError, match="TrainsOtherwise acts otherwise when it is built for inference only"):
+    with pytest.raises(UnsupportedError, match="TrainsOtherwise acts differently when it is built for inference only"):
         export("trains_otherwise")
 
 

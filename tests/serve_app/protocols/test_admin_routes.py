@@ -375,5 +375,5 @@ def test_serve_takes_versions_from_a_file_and_options_win(tmp_path: Path) -> Non
     with pytest.raises(UsageError, match="cannot be read"):
         served_config(file, None, None, None, None)
     file.write_text("[1]")
-    with pytest.raises(UsageError, match="expected a map with 'policies'"):
+    with pytest.raises(UsageError, match="expected a map whose 'policies' is a map"):
         served_config(file, None, None, None, None)
