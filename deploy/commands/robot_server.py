@@ -219,13 +219,14 @@ def robot_latency(
     ur_model: Annotated[str, typer.Option(help=f"Model: {MODELS}.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
+    hours: Annotated[float, typer.Option(min=0.0, help="Measure at least for so long: half an hour shows more.")] = 0.0,
     limit: Limit = None,
     yes: Annotated[bool, typer.Option("--yes", help="Move without confirmation.")] = False,
     as_json: Json = False,
 ) -> None:
     """Measure a real arm's latency. Prints the evaluation that a policy for this arm must pass.
 
-    Measures from command to motion: wrist_3 turns by 0.05 rad, back and forth.
+    Measures from command to motion: wrist_3 turns by 0.05 rad, back and forth. `--json` has histograms.
 
     Example: `rlservo robot-latency rtde://192.168.0.2 --ur-model ur5e`
     """
@@ -241,12 +242,18 @@ def robot_latency(
         host = host_of(robot)
         if host is None:
             raise RobotError(f"robot {robot!r} is simulated: expected rtde://HOST or ros2:")
-        Operator(is_asked=not yes).confirm(f"wrist_3 of the robot at {host} turns by {STEP:g} rad, {steps} times")
+        often = f"for {hours:g} hours" if hours else f"{steps} times"
+        Operator(is_asked=not yes).confirm(f"wrist_3 of the robot at {host} turns by {STEP:g} rad, {often}")
         arm = ArmProcess(host, ur_model, setpoint_timeout_s=0.5, limits=Limits.of(parse_env_arguments(limit or [])))
         try:
-            with terminal.status(f"0 of {steps} motions") as show:
+            all_of = "" if hours else f" of {steps}"
+            with terminal.status(f"0{all_of} motions") as show:
                 report = measure_latency(
-                    arm, steps=steps, control_rate_hz=control_rate, on_step=lambda n: show(f"{n} of {steps} motions")
+                    arm,
+                    steps=steps,
+                    hours=hours,
+                    control_rate_hz=control_rate,
+                    on_step=lambda done: show(f"{done}{all_of} motions"),
                 )
         finally:
             arm.close()
@@ -254,10 +261,14 @@ def robot_latency(
     if as_json:
         print_json(dataclasses.asdict(report) | {"disturbance": report.disturbance})
         return
+    motions, periods = report.latencies, report.periods
     terminal.output().print(
-        f"command to motion: p50 {report.p50_ms:.0f}, p95 {report.p95_ms:.0f}, max {report.max_ms:.0f} ms, jitter "
-        f"{report.jitter_ms:.0f} ms over {steps} motions; a state every {report.state_period_ms:.3g} ms; joints at "
-        f"rest within {report.noise:.1e} rad\n"
+        f"command to motion: p50 {report.p50_ms:.0f}, p95 {report.p95_ms:.0f}, p99 {motions.p99_ms:.0f}, p99.9 "
+        f"{motions.p999_ms:.0f}, max {report.max_ms:.0f} ms, jitter {report.jitter_ms:.0f} ms over {report.steps} "
+        f"motions; a state every {report.state_period_ms:.3g} ms; joints at rest within {report.noise:.1e} rad\n"
+        f"command to command: p50 {periods.p50_ms:.3g}, p99 {periods.p99_ms:.3g}, p99.9 {periods.p999_ms:.3g}, max "
+        f"{periods.longest_ms:.3g} ms over {sum(periods.counts):,} setpoints, "
+        f"{'with' if report.is_realtime else 'without'} a PREEMPT_RT kernel\n"
         f"at {control_rate:g} Hz this is up to {report.cycles} cycles. The policy must pass:\n"
         f"rlservo verify BUNDLE {report.disturbance} --disturb --write "
         f"--env rlservo/EndEffectorPositioningURSim-v0 --env-arg ur_model={ur_model}",

@@ -173,6 +173,11 @@ class ArmProcess:
         counts = self._report.read()["limited"]
         return {name: int(count) for name, count in zip(COUNTED, counts, strict=True) if count}
 
+    def periods(self) -> tuple[Vector, float]:
+        """Return the number of the stream's periods by their length, in bins of PERIOD_S, and the longest [s]."""
+        report = self._report.read()
+        return report["periods"], float(report["longest_period_s"])
+
     @property
     def fault(self) -> str:
         """The reason why the arm no longer accepts commands; empty if it does."""

@@ -6,11 +6,13 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from rlservo.robots.arm_interface import ROS2, RobotError, Vector
 from rlservo.robots.arm_process import ArmProcess
+from rlservo.robots.servo_loop import PERIOD_S
 from rlservo.robots.ur.parameters import JOINTS
 
 JOINT = JOINTS.index("wrist_3")  # turns the tool in place: the only joint whose motion cannot hit anything
@@ -22,7 +24,32 @@ TARGET_NOTICED = 1e-6  # [rad], of the controller's setpoint, which has no noise
 PAUSE_S = 0.5
 TIMEOUT_S = 2.0
 LOOK_S = 0.001
+REALTIME = Path("/sys/kernel/realtime")  # 1 with PREEMPT_RT
 AGAIN_S = 0.05  # [s], between two setpoints of the same motion
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Durations, counted in bins of `bin_ms` from 0 on. A percentile is the end of its bin, at most the longest."""
+
+    p50_ms: float
+    p99_ms: float
+    p999_ms: float
+    longest_ms: float
+    bin_ms: float
+    counts: list[int]
+
+    @classmethod
+    def of(cls, counts: Vector, bin_ms: float, longest_ms: float) -> Histogram:
+        """Return the histogram of these counts; the last bin has no end."""
+        summed = counts.cumsum()
+
+        def end_ms(share: float) -> float:
+            place = int(np.searchsorted(summed, share * summed[-1]))
+            return min(bin_ms * (place + 1), longest_ms) if place < counts.size - 1 else longest_ms
+
+        kept = [int(count) for count in np.trim_zeros(counts, "b")]
+        return cls(end_ms(0.5), end_ms(0.99), end_ms(0.999), longest_ms, bin_ms, kept)
 
 
 @dataclass(frozen=True)
@@ -38,6 +65,9 @@ class LatencyReport:
     noise: float  # [rad], standard deviation of a joint at rest
     control_rate_hz: float
     cycles: int
+    latencies: Histogram
+    periods: Histogram  # of the command stream: between two setpoints
+    is_realtime: bool  # the kernel has PREEMPT_RT
 
     @property
     def disturbance(self) -> str:
@@ -46,9 +76,16 @@ class LatencyReport:
 
 
 def measure_latency(
-    arm: ArmProcess, *, steps: int = 20, control_rate_hz: float = 10.0, on_step: Callable[[int], None] = lambda _: None
+    arm: ArmProcess,
+    *,
+    steps: int = 20,
+    hours: float = 0.0,
+    control_rate_hz: float = 10.0,
+    on_step: Callable[[int], None] = lambda _: None,
 ) -> LatencyReport:
-    """Move a wrist back and forth by 0.05 rad and time each start. Raises RobotError if nothing moves.
+    """Move a wrist back and forth by 0.05 rad and time each start, `steps` times and at least for these `hours`.
+
+    Raises RobotError if nothing moves.
 
     A reduced speed scaling stretches the arm's motions, its lag too. Then the start of the controller's setpoint is
     timed, and half of the look-ahead time added, the lag at full scaling.
@@ -61,9 +98,13 @@ def measure_latency(
     latencies_s: list[float] = []
     periods_s: list[float] = []
     still: list[Vector] = []
-    for _ in range(3 * steps):
-        if len(latencies_s) == steps:
-            break
+    end_s, missed = time.monotonic() + 3600 * hours, 0
+    while len(latencies_s) < steps or time.monotonic() < end_s:
+        if missed >= 2 * max(steps, len(latencies_s)):
+            arm.go_to(home)
+            raise RobotError(
+                f"this computer missed the start of {missed} motions of {STEP_S:g} s: end other work on it, and repeat"
+            )
         arm.hold()
         target = _wait_for_rest(arm, is_full=is_full)
         still.append(arm.arm_state().positions)
@@ -76,18 +117,18 @@ def measure_latency(
         if moved_s := _first_motion(arm, goal, began, target, periods_s):
             latencies_s.append(moved_s - began + lag_s)
             on_step(len(latencies_s))
+        else:
+            missed += 1
         while time.monotonic() - began < STEP_S:
             arm.command(goal, max(began + STEP_S - time.monotonic(), AGAIN_S))
             time.sleep(AGAIN_S)
     arm.go_to(home)
-    if len(latencies_s) < steps:
-        raise RobotError(
-            f"this computer missed the start of {2 * steps} motions of {STEP_S:g} s: end other work on it, and repeat"
-        )
+    counts, longest_s = arm.periods()
     p5, p50, p95 = (1e3 * float(value) for value in np.percentile(latencies_s, (5, 50, 95)))
     worst = 1e3 * max(latencies_s)
+    motions = np.bincount([int(1e3 * latency_s) for latency_s in latencies_s]).astype(np.float64)
     return LatencyReport(
-        steps=steps,
+        steps=len(latencies_s),
         p50_ms=p50,
         p95_ms=p95,
         max_ms=worst,
@@ -96,6 +137,9 @@ def measure_latency(
         noise=float(np.std([one[:JOINT] for one in still], axis=0).max()),
         control_rate_hz=control_rate_hz,
         cycles=max(1, math.ceil(worst / 1e3 * control_rate_hz)),
+        latencies=Histogram.of(motions, 1.0, worst),
+        periods=Histogram.of(counts, 1e3 * PERIOD_S, 1e3 * longest_s),
+        is_realtime=REALTIME.is_file() and REALTIME.read_text().strip() == "1",
     )
 
 

@@ -40,6 +40,7 @@ AT_REST, SLOW = 1e-3, 0.01  # [rad/s], of the setpoint, of the arm
 CATCH_UP_S = 1.0  # [s] in which an arm comes to rest behind its setpoint
 REASON_S = 0.5  # [s], counted from a refused command, for its cause to become known
 CLOSE_S = 4.0  # [s], for closing the connections
+PERIOD_S, PERIODS = 1e-4, 500  # [s] width of a bin, and number of bins, of the periods' histogram; the last has no end
 
 
 ORDERS = np.dtype(
@@ -49,7 +50,8 @@ ORDERS = np.dtype(
 REPORT = np.dtype(
     [("phase", "f8"), ("received_s", "f8"), ("time_s", "f8"), ("age_s", "f8"), ("positions", "f8", 6),
      ("velocities", "f8", 6), ("robot_mode", "f8"), ("safety_mode", "f8"), ("setpoint", "f8", 6), ("blend", "f8"),
-     ("scale", "f8"), ("target", "f8", 6), ("written_s", "f8"), ("limited", "f8", len(COUNTED))]
+     ("scale", "f8"), ("target", "f8", 6), ("written_s", "f8"), ("limited", "f8", len(COUNTED)),
+     ("periods", "f8", PERIODS), ("longest_period_s", "f8")]
 )  # fmt: skip
 
 
@@ -80,6 +82,7 @@ class ServoLoop:
         self._goal, self._goal_due_s, self._number = self._limiter.position.copy(), 0.0, -1.0
         self._following = Following(connection.following)
         self._counts = np.zeros(len(COUNTED))
+        self._periods, self._longest_period_s = np.zeros(PERIODS), 0.0
         self._law = ControlLaw(
             setpoint_timeout_s=settings.setpoint_timeout_s, blend_s=self._limits.blend_s, forget_s=FORGET_S
         )
@@ -98,6 +101,9 @@ class ServoLoop:
                 time.sleep(due - now)
                 now = time.monotonic()
             due = max(due + self._dt, now - self._dt)
+            if not is_first:
+                self._periods[min(int((now - cycle_s) / PERIOD_S), PERIODS - 1)] += 1
+                self._longest_period_s = max(self._longest_period_s, now - cycle_s)
             if now - cycle_s > AGE_BOUND_S:  # this process was suspended: the arm stands at its last setpoint
                 self._limiter.restart(self._limiter.position)
                 self._law.blend = 0.0
@@ -241,6 +247,8 @@ class ServoLoop:
                 "target": self._seen.targets,
                 "written_s": time.monotonic(),
                 "limited": self._counts,
+                "periods": self._periods,
+                "longest_period_s": self._longest_period_s,
             }
         )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from typing import Any
 
@@ -80,3 +82,26 @@ def test_arm_whose_slider_is_at_a_tenth_is_measured_too(arm: RunningArm) -> None
     finally:
         real.close()
     assert 200.0 <= report.p50_ms <= 400.0  # as at full speed
+
+
+def test_periods_are_those_between_two_setpoints_and_suspensions_are_among_them(arm: RunningArm) -> None:
+    real = ArmProcess(arm.host, "ur5", setpoint_timeout_s=0.5, limits=Limits(watchdog_hz=1.0))
+
+    def suspend(_motion: int) -> None:
+        os.kill(real.pid, signal.SIGSTOP)
+        time.sleep(0.07)
+        os.kill(real.pid, signal.SIGCONT)
+
+    began = time.monotonic()
+    try:
+        report = measure_latency(real, steps=5, hours=12 / 3600, on_step=suspend)
+    finally:
+        real.close()
+    took_s = time.monotonic() - began
+    assert took_s > 12 and report.steps > 5
+    periods, motions = report.periods, report.latencies
+    assert 0.5 < 0.008 * sum(periods.counts) / took_s < 1.02  # 125 setpoints a second
+    assert 7.5 < periods.p50_ms < 12.0 and 70.0 < periods.longest_ms < 1000.0
+    assert len(periods.counts) == 500 and periods.counts[-1] >= report.steps - 1  # of 50 ms and more
+    assert sum(motions.counts) == report.steps and motions.longest_ms == report.max_ms
+    assert abs(motions.p50_ms - report.p50_ms) < 20.0
