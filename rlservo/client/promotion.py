@@ -26,6 +26,7 @@ from rlservo.client.promotion_evidence import (
     check_lag,
     figures,
     has_ended,
+    late_requests,
     lost_workers,
     read_metrics,
 )
@@ -74,6 +75,7 @@ class PromotionState:
     generation: int = 0  # of the newest plan that was seen
     decided: Outcome | None = None
     counts: Counts = field(default_factory=lambda: Counts({}, {}))
+    late_before: tuple[float, float] = (0.0, 0.0)  # `late_requests` of the time before
     lost: dict[str, float] = field(default_factory=dict)  # workers that had died at the start, by address
 
 
@@ -162,7 +164,8 @@ class Promotion:
                     f"ends it ({self._last_change})"
                 )
         self._state.production = policy["version"]
-        self._count()
+        late = [late_requests(numbers) for numbers in self._count().values()]
+        self._state.late_before = (sum(count for count, _ in late), sum(of for _, of in late))
         self._write("start")
 
     def _start(self) -> None:
@@ -218,7 +221,7 @@ class Promotion:
                 return Outcome(ROLLED_BACK, f"it could not be judged for {PATIENCE_S:g} s: {error.message}")
             before, now = now, self.clock()
             state.remaining_s = max(0.0, state.remaining_s - (now - before))
-            found = list(figures(terms.limits, state.counts.total, state.production, terms.version))
+            found = list(figures(terms.limits, state.counts.total, state.production, terms.version, state.late_before))
             surely, shown = [each for each in found if each.is_surely_beyond], "; ".join(map(str, found))
             is_last = bool(surely) or state.remaining_s == 0
             if is_last or logged_s - state.remaining_s >= terms.seconds / MOST_CHECKS:

@@ -8,10 +8,11 @@ A process that died is evidence against the version on trial: its last request h
 workers counts those that did not end in order. Another process has died, or was ended, if it no longer answers or has
 started again; one that joins is no evidence.
 
-A limit is the share of requests, actions or episodes that may count against a version: failed requests, requests slower
-than the p99 (1%), actions further apart (1%), episodes without success (production's share plus the drop). During the
-watch a version is rolled back if the lower bound of the share's 99.7% interval is above the limit, with at least three
-cases. At the end the share itself decides.
+A limit is the share of requests, actions or episodes that may count against a version: failed requests, requests of any
+version that waited too long (the share before plus the limit: while one is computed, all wait), requests slower than
+the p99 (1%), actions further apart (1%), episodes without success (production's share plus the drop). During the watch
+a version is rolled back if the lower bound of the share's 99.7% interval is above the limit, with at least three cases.
+At the end the share itself decides.
 
 Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22 (1927).
 """
@@ -19,6 +20,7 @@ Source: E. B. Wilson, "Probable inference, the law of succession, and statistica
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -141,9 +143,9 @@ FEWEST = 3  # cases against a version before anything stops early
 TAIL = 0.01  # share of the requests and actions beyond a p99
 CLIENTS_OWN = {  # failures that are not the version's fault
     *("bad-request", "wrong-media-type", "too-large", "unauthenticated", "forbidden", "rate-limited", "idle"),
-    *("bad-observation", "session-conflict", "session-lost", "late", "over-capacity", "deadline-passed"),
-    "unavailable",
+    *("bad-observation", "session-conflict", "session-lost", "unavailable"),
 }
+LATE = ("late", "over-capacity", "deadline-passed")  # one slow version keeps the requests of every version waiting
 
 
 @dataclass(frozen=True)
@@ -188,8 +190,14 @@ class Figure:
         )
 
 
-def figures(limits: PromotionLimits, total: Numbers, production: str, candidate: str) -> Iterator[Figure]:
-    """Yield a figure for every limit."""
+def figures(
+    limits: PromotionLimits,
+    total: Numbers,
+    production: str,
+    candidate: str,
+    late_before: tuple[float, float] = (0.0, 0.0),
+) -> Iterator[Figure]:
+    """Yield a figure for every limit; `late_before` is `late_requests` of the time before the promotion."""
 
     def of_requests(what: str, against: float, cases: float, allowed: float) -> Figure:
         # With fewer, a version at its limit would more likely than not have no case against it.
@@ -199,10 +207,16 @@ def figures(limits: PromotionLimits, total: Numbers, production: str, candidate:
 
     if limits.error_rate is not None:
         outcomes = group(total, OUTCOMES, candidate)
-        faults = {code for code, count in outcomes.items() if count} - CLIENTS_OWN - {"ok"}
+        faults = {code for code, count in outcomes.items() if count} - CLIENTS_OWN - {"ok", *LATE}
         failed = sum(outcomes[code] for code in faults)
         what = f"failed requests ({', '.join(sorted(faults))})" if faults else "failed requests"
         yield of_requests(what, failed, outcomes.get("ok", 0.0) + failed, limits.error_rate)
+        (late, requests), before = late_requests(total), late_before[0] / max(late_before[1], 1.0)
+        if late:
+            high = interval(*late_before)[1] if late_before[1] else 0.0
+            what = "requests of all versions that waited too long"
+            allowed = before + limits.error_rate
+            yield Figure(what, late, requests, allowed, surely=high + limits.error_rate)
     if limits.p99_s is not None:
         bound, slower, cases = _beyond(total, limits.p99_s, ANSWERS, candidate)
         yield of_requests(f"requests above {1e3 * bound:g} ms", slower, cases, TAIL)
@@ -225,6 +239,16 @@ def interval(against: float, cases: float) -> tuple[float, float]:
     share, square = against / cases, Z * Z / cases
     centre, width = share + square / 2, Z * math.sqrt(share * (1 - share) / cases + square / (4 * cases))
     return (centre - width) / (1 + square), (centre + width) / (1 + square)
+
+
+def late_requests(total: Numbers) -> tuple[float, float]:
+    """Return how many requests of all versions waited too long, and of how many."""
+    counts: defaultdict[str, float] = defaultdict(float)
+    for path, count in total.items():
+        if path.startswith(f"{OUTCOMES}/"):
+            counts[path.rpartition("/")[2]] += count
+    late = sum(counts[code] for code in LATE)
+    return late, late + counts["ok"]
 
 
 def _unsuccessful(total: Numbers, version: str) -> tuple[float, float]:

@@ -355,11 +355,15 @@ def test_what_robots_send_wrong_is_not_the_canarys(run: Any, server: Server) -> 
         server.ask(20, obs=OBS[1:])
         server.ask(20, obs=[*OBS[1:], math.nan])
         server.ask(20, obs=OBS, no_such_field=1)
-        server.ask(20, obs=OBS, deadline_ms=1e-6)
 
     outcome = run("2", share=1.0)(lambda: server.ask(40), ask_wrongly)
     assert outcome.outcome == PROMOTED, outcome
     assert server.failed("2", "bad-observation") >= failed + 20  # it is counted, and not held against it
+
+
+def test_a_canary_whose_computing_makes_requests_late_is_rolled_back(run: Any, server: Server) -> None:
+    outcome = run("2", share=0.1)(lambda: server.ask(300), lambda: server.ask(100, obs=OBS, deadline_ms=1e-6))
+    assert outcome.outcome == ROLLED_BACK and "requests of all versions that waited too long: 100 of 400" in outcome.why
 
 
 def test_a_canary_that_refuses_what_production_takes_is_rolled_back(

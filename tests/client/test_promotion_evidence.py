@@ -61,10 +61,24 @@ def test_a_single_failure_decides_nothing_and_many_decide_at_once() -> None:
     assert not none.is_beyond and not none.lacks
 
 
-def test_what_clients_do_wrong_and_what_the_server_turns_away_is_not_the_versions() -> None:
-    codes = ("bad_request", "unauthenticated", "rate_limited", "late", "over_capacity", "deadline_passed")
+def test_what_clients_do_wrong_is_not_the_versions() -> None:
+    codes = ("bad_request", "unauthenticated", "rate_limited", "session_lost", "unavailable")
     seen = figure(outcomes(ok=2000, **dict.fromkeys(codes, 50.0)), error_rate=0.001)
     assert (seen.against, seen.cases, seen.is_beyond) == (0.0, 2000, False)
+
+
+@pytest.mark.parametrize("code", ["late", "over-capacity", "deadline-passed"])
+def test_requests_of_any_version_that_wait_count_against_the_one_on_trial(code: str) -> None:
+    """A slow version keeps those of production waiting."""
+    others = {f"{OUTCOMES}/1/ok": 900.0, f"{OUTCOMES}/1/{code}": 30.0, f"{OUTCOMES}/2/{code}": 20.0}
+    failed, late = figures(PromotionLimits(error_rate=0.02), outcomes(ok=200) | others, "1", "2")
+    assert (failed.against, failed.cases) == (0.0, 200.0)
+    assert (late.against, late.cases, late.is_surely_beyond, late.lacks) == (50.0, 1150.0, True, "")
+    _, late_as_before = figures(
+        PromotionLimits(error_rate=0.02), outcomes(ok=200) | others, "1", "2", (300.0, 10_000.0)
+    )
+    assert not late_as_before.is_beyond
+    assert str(late) == "requests of all versions that waited too long: 50 of 1,150, 4.35% (allowed 2%)"
 
 
 def test_a_rare_limit_wants_more_requests() -> None:
