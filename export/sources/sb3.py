@@ -144,6 +144,12 @@ def find_statistics(model: Path, data: Mapping[str, Any], given: Path | None, no
         notify("the model is exported without VecNormalize")
         return None
     if (statistics := given or statistics_beside(model)) is not None:
+        has_acted = "replay_buffer_class" not in data and _pickled(data.get("_last_obs"))
+        if given is None and has_acted and not shows_vecnormalize(data):
+            raise CheckpointError(
+                f"{model}: the model was trained without VecNormalize, and {statistics.name} lies beside it: give "
+                f"--vecnormalize none, or --vecnormalize {statistics} if it is this model's all the same"
+            )
         notify(f"VecNormalize is the one of {statistics}")
         return statistics
     if shows_vecnormalize(data):

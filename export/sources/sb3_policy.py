@@ -438,6 +438,4 @@ def _check_spaces(file: Path, observation_space: Any, action_space: Any) -> None
     if not isinstance(action_space, Box | Discrete | MultiDiscrete | MultiBinary):
         raise UnsupportedError(f"{file}: the action space {action_space} is not exported: {EXPORTED}")
     if isinstance(action_space, Box) and action_space.dtype not in (np.float32, np.float64):
-        raise UnsupportedError(
-            f"{file}: the action space {action_space} is not exported: of Boxes, only float ones are"
-        )
+        raise UnsupportedError(f"{file}: the action space {action_space} is not exported: expected float32 or float64")

@@ -439,7 +439,7 @@ class TestBroken:
 
     def test_actions_that_are_whole_numbers(self, tmp_path: Path) -> None:
         make(sb3.PPO, "MlpPolicy", VECTOR, spaces.Box(0, 5, (2,), np.int32)).save(tmp_path / "model")
-        self.refused(tmp_path / "model.zip", "only float Boxes are", UnsupportedError)
+        self.refused(tmp_path / "model.zip", "expected float32 or float64", UnsupportedError)
 
     def test_weights_of_another_observation(self, tmp_path: Path) -> None:
         model = make(sb3.PPO, "MlpPolicy", VECTOR, BOX)

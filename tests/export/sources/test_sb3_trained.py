@@ -192,6 +192,20 @@ def test_a_model_whose_rewards_alone_were_normalized_is_exported_by_choice(
     verify_bundle(result.path, model, vecnormalize="none", notify=notices.append)
 
 
+@pytest.mark.parametrize("name", ["PPO", "ARS", "RecurrentPPO"])
+def test_a_model_that_shows_no_vecnormalize_is_refused_beside_anothers_statistics(
+    name: str, tmp_path: Path, notices: list[str]
+) -> None:
+    model = train(name, VECTOR, tmp_path)
+    (tmp_path / "other").mkdir()
+    train(name, VECTOR, tmp_path / "other", VecNormalize)
+    statistics = (tmp_path / "other" / "vecnormalize.pkl").rename(tmp_path / "vecnormalize.pkl")
+    with pytest.raises(CheckpointError, match=r"trained without VecNormalize, and vecnormalize\.pkl lies beside it"):
+        export_checkpoint(model, tmp_path / "out", notify=notices.append)
+    given = export_checkpoint(model, tmp_path / "out", vecnormalize=statistics, notify=notices.append)
+    assert given.contract.baked_in[0].step == "mean_std_filter"
+
+
 def test_statistics_of_another_model_beside_it_are_left_alone_by_choice(tmp_path: Path, notices: list[str]) -> None:
     model = train("SAC", VECTOR, tmp_path)
     (tmp_path / "other").mkdir()
