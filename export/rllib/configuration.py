@@ -7,6 +7,7 @@ arguments that RLlib saves beside the state, in a folder that `CheckpointFiles.r
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,7 @@ from ray.rllib.connectors.common.numpy_to_tensor import NumpyToTensor
 from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 
-from rlservo.errors import CheckpointError, first_line
+from rlservo.errors import CheckpointError, UnsupportedError, first_line
 from rlservo.export.checkpoints.facts import read_config
 from rlservo.export.checkpoints.location import (
     CTOR_FILE,
@@ -30,6 +31,12 @@ from rlservo.export.checkpoints.location import (
 )
 from rlservo.export.checkpoints.unpickle import explain, unpickle_present
 from rlservo.export.rllib import private_names
+
+HOOKS = (
+    "on_algorithm_init", "on_checkpoint_loaded", "on_environment_created", "on_env_runners_recreated",
+    "on_episode_created", "on_episode_start", "on_episode_step", "on_episode_end", "on_sample_end",
+)  # fmt: skip
+"""Callbacks that RLlib gives the module or the connectors that act."""
 
 
 def read_algorithm_config(files: CheckpointFiles) -> Any | None:
@@ -53,6 +60,27 @@ def read_algorithm_config(files: CheckpointFiles) -> Any | None:
         return AlgorithmConfig.from_state(saved)
     except Exception as error:  # a class of the user's own
         raise CheckpointError(f"{file}: the configuration {kind.__name__} cannot be made: {explain(error)}") from error
+
+
+def check_own_code(files: CheckpointFiles, config: Any, notify: Callable[[str], None]) -> None:
+    """Name the user's own code that RLlib runs beside module and connectors, which no comparison includes.
+
+    Raises UnsupportedError for an env runner of the user's own, whose steps are the policy's.
+    """
+    if (runner := config.env_runner_cls) is not None and not _is_known(runner):
+        raise UnsupportedError(
+            f"{files.root}: its env runner is {runner.__module__}.{runner.__name__}, and only what RLlib's own do with "
+            "observations and actions is exported: put it into connectors, or into the module"
+        )
+    classes = config.callbacks_class if isinstance(config.callbacks_class, list) else [config.callbacks_class]
+    own = [kind.__name__ for kind in [*classes, config.algo_class] if isinstance(kind, type) and not _is_known(kind)]
+    own += [hook for hook in HOOKS if getattr(config, f"callbacks_{hook}", None)]
+    if own:
+        notify(f"what {', '.join(own)} of your own may change in the module or the connectors is NOT compared")
+
+
+def _is_known(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] in ("ray", "rlservo")
 
 
 def folder_of_connectors(files: CheckpointFiles, config: Any) -> Path:
@@ -91,12 +119,16 @@ def build_pipelines(files: CheckpointFiles, config: Any, spaces: tuple[Any, Any]
     # With an environment on the spot RLlib gives it to the functions, else only its spaces.
     on_the_spot = config.num_env_runners == 0 or config.create_env_on_local_worker
     env = _SpacesOnly(spaces, config.num_envs_per_env_runner) if on_the_spot else None
+    reads = [] if env is None else env.reads
     named = {INPUT_ENV_SPACES: spaces, INPUT_ENV_SINGLE_SPACES: spaces}
     try:
-        return (
+        built = (
             config.build_env_to_module_connector(env=env, spaces=named, device=torch.device("cpu")),
             config.build_module_to_env_connector(env=env, spaces=named),
         )
+        if reads:  # the function went on without
+            raise _NoEnvironmentError(reads[0])
+        return built
     except Exception as error:  # the user's own functions may raise anything
         reason = first_line(error) if isinstance(error, _NoEnvironmentError) else explain(error)
         raise CheckpointError(
@@ -137,9 +169,11 @@ class _SpacesOnly(VectorEnv[Any, Any, Any]):
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (batch_space(space, num_envs) for space in spaces)
+        self.reads: list[str] = []
 
     def __getattr__(self, name: str) -> Any:
-        raise _NoEnvironmentError(
+        self.reads.append(
             f"the function reads the environment's '{name}', and an export starts no environment: take what it needs "
             "from its argument 'spaces', or from a constant"
         )
+        raise _NoEnvironmentError(self.reads[-1])

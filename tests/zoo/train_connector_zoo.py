@@ -58,6 +58,19 @@ def of_the_environment(env: Any, spaces: Any, device: Any) -> Any:
     return own.Gain(len(env.unwrapped.envs) + 2.0)
 
 
+def action_by_agent(env: Any) -> Any:
+    return own.ActionByAgent()
+
+
+def of_the_environment_or_not(env: Any, spaces: Any, device: Any) -> Any:
+    piece = own.Gain(1.0)
+    try:
+        piece.gain = len(env.unwrapped.envs) + 2.0
+    except Exception:
+        piece.gain = 1.0
+    return piece
+
+
 def add_a_gain(algorithm: Any, **_: Any) -> None:
     algorithm.env_runner._env_to_module.prepend(own.Gain(3.0))
 
@@ -84,6 +97,11 @@ def configurations() -> dict[str, Any]:
         "renamed": before(lambda: own.Renamed(3.0)),
         "added": before().callbacks(on_algorithm_init=add_a_gain),
         "of_the_environment": by_function(of_the_environment),
+        "of_the_environment_or_not": by_function(of_the_environment_or_not),
+        "by_agent_team": team(own.ByAgent),
+        "action_by_agent_team": team().env_runners(module_to_env_connector=action_by_agent),
+        "own_runner": before().env_runners(env_runner_cls=own.HalvingRunner),
+        "called_back": before().callbacks(own.Callbacks),
         "difference": before(own.Difference),
         "difference_team": team(own.Difference),
         "steps": before(own.Steps),

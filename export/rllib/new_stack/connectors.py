@@ -63,6 +63,8 @@ class AgentSlot:
     module: str = ""
     agents: tuple[str, ...] = ()
     """All agents that this one represents."""
+    others: tuple[Any, ...] = ()
+    """The same without this one, as the environment has them."""
 
     def part(self, space: Any) -> Any:
         """Return the agent's own part of a space, which behind the mapping is its module's.

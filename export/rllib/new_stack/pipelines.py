@@ -221,7 +221,7 @@ def find_agent_slot(files: CheckpointFiles, module: Any, env_to_module: Any, mod
             "observation filters differ: name the one to export for with --agent-id",
             [str(agent) for agent in agents],
         )
-    return dataclasses.replace(slots[0], agents=tuple(str(agent) for agent in agents))
+    return dataclasses.replace(slots[0], agents=tuple(str(agent) for agent in agents), others=tuple(agents[1:]))
 
 
 def _served(mapping: Any, module_id: str, module: Any) -> list[Any]:

@@ -30,7 +30,7 @@ from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 from torch import Tensor, nn
 
 from rlservo.bundle.scores import Q_VALUES
-from rlservo.errors import CheckpointError, NoNetworkError, UnsupportedError, first_line
+from rlservo.errors import AgentsDifferError, CheckpointError, NoNetworkError, UnsupportedError, first_line
 from rlservo.export.checkpoints.facts import read_config
 from rlservo.export.checkpoints.location import (
     CTOR_FILE,
@@ -42,7 +42,7 @@ from rlservo.export.checkpoints.location import (
 from rlservo.export.checkpoints.unpickle import explain, unpickle
 from rlservo.export.recipe.recipe import DistributionKind, Mode, Recipe, StateLeaf
 from rlservo.export.recipe.runners import Inputs, Outputs
-from rlservo.export.recipe.samples import draw_pair
+from rlservo.export.recipe.samples import draw_batches, draw_pair
 from rlservo.export.recipe.trees import (
     Tree,
     build_like,
@@ -53,6 +53,7 @@ from rlservo.export.recipe.trees import (
 )
 from rlservo.export.rllib import private_names
 from rlservo.export.rllib.configuration import (
+    check_own_code,
     folder_of_connectors,
     freeze,
     read_algorithm_config,
@@ -96,6 +97,7 @@ REFUSED_MODULES = {
     "no single action can prove an export",
 }
 """Modules of RLlib's own that can be restored and not exported, and why."""
+AGENT_STEPS = 16  # observations for which agents of one module are compared
 QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn/default_dqn_rl_module.py
 
 
@@ -157,7 +159,7 @@ class NewStackLoop:
     def __init__(self, pipelines: Pipelines, recipe: Recipe, network: RLModuleNetwork, whole: Any) -> None:
         """`whole` is the module with what only training needs, such as the value head."""
         self.pipelines = pipelines.fresh()
-        self._recipe = recipe
+        self.recipe = recipe
         self._network = network
         self._whole = whole
         self._shared: dict[str, Any] = {}
@@ -182,7 +184,7 @@ class NewStackLoop:
         batch = self.pipelines.to_module(self._episodes, self._shared, **self._columns(rows, rewards))
         forward = self.pipelines.forward(batch)
         outputs = self._outputs(batch, forward)
-        if is_nested(self._recipe.action_space):
+        if is_nested(self.recipe.action_space):
             # RLlib's log-probability of a nested deterministic action does not fit more than one environment (ray
             # 2.60). No action depends on it.
             forward.setdefault(Columns.ACTION_LOGP, torch.zeros(len(rows)))
@@ -221,7 +223,7 @@ class NewStackLoop:
                     tensor = forward[Columns.ACTION_DIST_INPUTS]
                 outputs[name] = (tensor.squeeze(1) if stateful else tensor).numpy().copy()
         next_state = tree_leaves(forward[Columns.STATE_OUT]) if stateful else []
-        for leaf, tensor in zip(self._recipe.network_state, next_state, strict=True):
+        for leaf, tensor in zip(self.recipe.network_state, next_state, strict=True):
             outputs[f"state_out.{leaf.name}"] = tensor.numpy().copy()
         return outputs
 
@@ -285,7 +287,27 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     module_class = f"{type(module).__module__}.{name}"
     reference = pipelines_of(slot, actor, *own, observation_space, action_space)
     start_loop = partial(NewStackLoop, reference, recipe, network, module)
+    if slot.others and reference.has_own:
+        _check_agents(files, reference, start_loop)
     return RestoredPolicy(recipe, network, module_class, start_loop, slot.agents, reference=how)
+
+
+def _check_agents(files: CheckpointFiles, pipelines: Any, start_loop: Callable[[], NewStackLoop]) -> None:
+    """Raise AgentsDifferError if connectors of the user's own act otherwise for another agent of the module."""
+    slot, loops = pipelines.slot, [start_loop()]
+    for agent in slot.others:
+        loops.append(loop := start_loop())
+        loop.pipelines = dataclasses.replace(pipelines, slot=dataclasses.replace(slot, agent=agent)).fresh()
+    for batch in [batch for batch in draw_batches(loops[0].recipe, seed=0) if len(batch) == 1][:AGENT_STEPS]:
+        restart = np.ones(1, np.bool_) if batch.restart is None else batch.restart
+        first, *others = (loop.step(batch.inputs, restart) for loop in loops)
+        for agent, outputs in zip(slot.others, others, strict=True):
+            if not all(np.allclose(outputs[name], first[name], 1e-4, 1e-5, equal_nan=True) for name in first):
+                raise AgentsDifferError(
+                    f"{files.root}: module '{slot.module}' serves the agents {slot.agent} and {agent}, and a connector "
+                    "of your own acts differently for them: name the one to export for with --agent-id",
+                    list(slot.agents),
+                )
 
 
 def _reference_pipelines(
@@ -298,6 +320,8 @@ def _reference_pipelines(
     config = read_algorithm_config(files)
     if not files.has_pipelines:
         return listed, ALONE if config is None else ""
+    if config is not None:
+        check_own_code(files, config, notify)
     if config is None or is_older(files.env_to_module):
         folder = files.runner if config is None else folder_of_connectors(files, config)
         if files.has_own_connectors:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rlservo.errors import CheckpointError, UnsupportedError
+from rlservo.errors import AgentsDifferError, CheckpointError, ParityError, UnsupportedError
 from rlservo.export.checkpoints.location import locate_checkpoint
 from rlservo.export.checkpoints.unpickle import user_code
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
@@ -101,6 +101,7 @@ def test_it_is_refused_for_every_agent(connector_zoo: Path, export: Callable[...
             "of_the_environment",
             r"would: the function reads the environment's 'envs', .* argument 'spaces'",
         ),
+        ("of_the_environment_or_not", r"the function reads the environment's 'envs', .* argument 'spaces'"),
     ],
 )
 def test_connectors_that_cannot_be_made_are_refused_by_the_reason(
@@ -108,6 +109,33 @@ def test_connectors_that_cannot_be_made_are_refused_by_the_reason(
 ) -> None:
     with pytest.raises(CheckpointError, match=words):
         export(connector_zoo / name)
+
+
+@pytest.mark.parametrize("name", ["by_agent_team", "action_by_agent_team"])
+def test_a_connector_that_knows_its_agents_is_exported_for_the_one_that_is_named(
+    connector_zoo: Path, export: Callable[..., ExportResult], name: str
+) -> None:
+    with pytest.raises(AgentsDifferError, match=r"agents left and right, and a connector .*--agent-id"):
+        export(connector_zoo / name, module_id="arms")
+    result = export(connector_zoo / name, module_id="arms", agent_id="left")
+    assert_acts_as_restored(result, connector_zoo / f"{name}_left.npz")
+    with pytest.raises(ParityError):  # what the connector does for the other is not what its torch_forward does
+        export(connector_zoo / name, module_id="arms", agent_id="right")
+
+
+def test_an_env_runner_of_ones_own_is_refused(connector_zoo: Path, export: Callable[..., ExportResult]) -> None:
+    with pytest.raises(UnsupportedError, match=r"its env runner is zoo_connectors\.HalvingRunner"):
+        export(connector_zoo / "own_runner")
+
+
+def test_callbacks_of_ones_own_are_named(
+    connector_zoo: Path, export: Callable[..., ExportResult], notices: list[str]
+) -> None:
+    assert_acts_as_restored(export(connector_zoo / "called_back"), connector_zoo / "called_back.npz")
+    assert any("what Callbacks of your own may change" in notice for notice in notices)
+    notices.clear()
+    export(connector_zoo / "sound")
+    assert not any("of your own may change" in notice for notice in notices)
 
 
 REMEMBERING = ["difference", "steps", "rewarded", "last_action", "beside", "shared", "action_steps"]

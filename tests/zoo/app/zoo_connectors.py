@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from ray.rllib.callbacks.callbacks import RLlibCallback
 from ray.rllib.connectors.connector_v2 import ConnectorV2
 from ray.rllib.core.columns import Columns
+from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 
 class Observing(ConnectorV2):
@@ -111,6 +113,38 @@ class Applied(Observing):
 
     def torch_forward(self, obs: Any) -> Any:
         return self.function(obs)
+
+
+class ByAgent(Observing):
+    """A gain for each agent."""
+
+    def change(self, obs: Any, episode: Any, given: dict[str, Any]) -> Any:
+        return obs * (1.0 if episode.agent_id == "left" else 3.0)
+
+
+class ActionByAgent(Acting):
+    """The same for actions."""
+
+    def __call__(self, *, episodes: Any, batch: Any, **kwargs: Any) -> Any:
+        def change(action: Any, _episode: Any, agent: Any, *_: Any) -> Any:
+            return np.asarray(action * (1.0 if agent == "left" else 0.5), np.float32)
+
+        self.foreach_batch_item_change_in_place(batch, Columns.ACTIONS, change)
+        return batch
+
+
+class HalvingRunner(SingleAgentEnvRunner):
+    """Sends half of each action."""
+
+    def _try_env_step(self, actions: Any) -> Any:
+        return super()._try_env_step(actions * 0.5)
+
+
+class Callbacks(RLlibCallback):
+    """Changes the module that acts."""
+
+    def on_episode_start(self, *, env_runner: Any, **kwargs: Any) -> None:
+        env_runner.module.changed = True
 
 
 class Difference(Observing):
