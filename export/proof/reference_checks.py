@@ -18,8 +18,10 @@ from rlservo.export.proof.differences import Comparer
 from rlservo.export.proof.references import Reference, record
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.recipe.runners import Loop, Outputs, first_step
+from rlservo.export.recipe.samples import Batch
 
 ALONE = 4  # samples of a batch that are also computed alone
+OUTLIERS = (3.0, 30.0, 1e3, 1e5, 1e7, 1e12, 1e30)  # times the largest number of the others
 REORDERED = 12  # batches that are also given with their keys in the opposite order
 REPEATED = 1e-6
 """Difference, relative to the largest number, that a processor's order of addition may leave between two runs."""
@@ -31,6 +33,8 @@ def check_reference(
     """Raise UnsupportedError unless the framework's answers are repeatable, independent and without hidden memory."""
     check_repeatable(start_loop, references)
     _check_independent(start_loop, recipe, references, comparer)
+    if not recipe.state:
+        _check_outliers(start_loop, references, comparer)
     _check_order(start_loop, references[:REORDERED], comparer)
     if not recipe.state:
         _check_stateless(start_loop, references, comparer)
@@ -88,6 +92,28 @@ def _check_independent(
                         f"{fault.got:.9g} alone): the network's result "
                         "depends on the other observations of the batch, which cannot be exported"
                     )
+
+
+def _check_outliers(start_loop: Callable[[], Loop], references: Sequence[Reference], comparer: Comparer) -> None:
+    """Compute some rows beside one that is far outside of what any sample is."""
+    number, reference = next(each for each in enumerate(references) if len(each[1].batch) > ALONE)
+    rows = slice(0, ALONE)
+    batches = []
+    for factor in OUTLIERS:
+        inputs = {name: values[: ALONE + 1].copy() for name, values in reference.batch.inputs.items()}
+        for values in inputs.values():
+            if values.dtype.kind == "f":
+                far = factor * max(1.0, float(np.nan_to_num(np.abs(values[rows])).max(initial=0.0)))
+                values[ALONE] = min(far, float(np.finfo(values.dtype).max) / 2)
+        batches.append(Batch(reference.batch.kind, inputs))
+    for factor, outputs in zip(OUTLIERS, record(start_loop, batches, reference.framework), strict=True):
+        among = {name: values[rows] for name, values in outputs.outputs.items()}
+        if (fault := comparer.compare(number, among, rows).fault) is not None:
+            raise UnsupportedError(
+                f"{reference.framework}'s own '{fault.output}' for an observation changes beside another one that is "
+                f"{factor:g} times as large (from {fault.expected:.9g} to {fault.got:.9g}): the network's result "
+                "depends on the other observations of the batch, which cannot be exported"
+            )
 
 
 def _check_order(start_loop: Callable[[], Loop], references: Sequence[Reference], comparer: Comparer) -> None:

@@ -6,6 +6,8 @@ arguments: class attributes, closures, defaults, and globals of its own modules.
 
 from __future__ import annotations
 
+import contextlib
+import contextvars
 import dis
 import functools
 import itertools
@@ -13,7 +15,7 @@ import random
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
-from types import CodeType, FunctionType, MethodType, ModuleType
+from types import CodeType, FunctionType, GeneratorType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -30,12 +32,15 @@ DEPTH = 12
 """Levels of objects in objects that are searched."""
 HOLDERS = ("_modules", "_buffers", "_parameters")
 """Dictionaries in which a module keeps its parts, and whose names nobody writes."""
+GLOBAL = ("_GLOBAL", "_NAME")
+"""Ends of the instructions for globals."""
 GENERATORS: dict[type, Callable[[Any], Any]] = {
     random.Random: lambda one: one.getstate(),
     np.random.Generator: lambda one: repr(one.bit_generator.state),
     np.random.RandomState: lambda one: repr(one.get_state(legacy=False)),
     torch.Generator: lambda one: one.get_state().numpy().tobytes(),
     itertools.count: repr,
+    contextvars.ContextVar: lambda one: repr(one.get(None)),
 }
 
 
@@ -49,6 +54,7 @@ def kept_values(value: Any, name: str = "", seen: set[int] | None = None) -> Ite
         return
     seen.add(id(value))
     if isinstance(value, Tensor):
+        yield from _of_attributes(value, name, seen)
         if not value.is_sparse:
             yield name, (value.shape, value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
     elif isinstance(value, np.ndarray):
@@ -63,8 +69,19 @@ def kept_values(value: Any, name: str = "", seen: set[int] | None = None) -> Ite
     elif isinstance(value, functools.partial):
         for part in (value.func, value.args, value.keywords):
             yield from kept_values(part, name, seen)
+    elif isinstance(value, GeneratorType):
+        if value.gi_frame is not None:  # it has not ended
+            yield f"{name}.gi_frame", value.gi_frame.f_lasti
+            yield from kept_values(value.gi_frame.f_locals, name, seen)
+    elif isinstance(value, Iterator) and type(value).__module__ in ("builtins", "itertools"):
+        with contextlib.suppress(TypeError):  # without a copy
+            yield from kept_values(value.__reduce__(), name, seen)
+    elif hasattr(value, "cache_info"):  # of functools.lru_cache
+        yield f"{name}.currsize", value.cache_info().currsize
+        yield from kept_values(value.__wrapped__, name, seen)
     elif isinstance(value, Mapping | Sequence | Set):
         yield name, len(value)
+        yield from _of_attributes(value, name, seen)
         items = value.items() if isinstance(value, Mapping) else enumerate(value if isinstance(value, Sequence) else ())
         for key, item in items:
             yield from kept_values(item, f"{name}.{key}", seen)
@@ -73,8 +90,18 @@ def kept_values(value: Any, name: str = "", seen: set[int] | None = None) -> Ite
     elif not isinstance(value, ModuleType | torch.jit.ScriptModule):
         for base in reversed(type(value).__mro__):
             yield from _of_class(base, name, seen)  # an attribute of the object itself comes later, and counts
-        for key, item in getattr(value, "__dict__", {}).items():
-            yield from kept_values(item, name if key in HOLDERS else f"{name}.{key}", seen)
+        yield from _of_attributes(value, name, seen)
+
+
+def _of_attributes(value: Any, name: str, seen: set[int]) -> Iterator[tuple[str, Any]]:
+    """Yield what is in an object's own attributes, and in the slots of a user's classes."""
+    for key, item in list(getattr(value, "__dict__", {}).items()):
+        yield from kept_values(item, name if key in HOLDERS else f"{name}.{key}", seen)
+    for base in type(value).__mro__:
+        slots = vars(base).get("__slots__", ()) if _is_own(base) else ()
+        for key in (slots,) if isinstance(slots, str) else slots:
+            if hasattr(value, key):
+                yield from kept_values(getattr(value, key), f"{name}.{key}", seen)
 
 
 def _is_own(code: Any) -> bool:
@@ -108,15 +135,15 @@ def _of_function(function: FunctionType, name: str, seen: set[int]) -> Iterator[
     for part in (function.__defaults__, function.__kwdefaults__, vars(function)):
         yield from kept_values(part, name, seen)
     used = set(_names(function.__code__))
-    names = {name for _, name in used}
-    for key in sorted({name for is_global, name in used if is_global} & function.__globals__.keys()):
+    names, stored = {name for _, name in used}, {name for does, name in used if does == "STORE_ATTR"}
+    for key in sorted({name for does, name in used if does.endswith(GLOBAL)} & function.__globals__.keys()):
         item, place = function.__globals__[key], f"{function.__module__}.{key}"
-        if isinstance(item, ModuleType | FunctionType | type) and _is_anothers(item, function):
-            continue
+        is_anothers = isinstance(item, ModuleType | FunctionType | type) and _is_anothers(item, function)
         if not isinstance(item, ModuleType):
-            yield from kept_values(item, place, seen)
+            if not is_anothers:
+                yield from kept_values(item, place, seen)
             continue
-        for attribute in sorted(names & vars(item).keys()):
+        for attribute in sorted((stored if is_anothers else names) & vars(item).keys()):
             yield from kept_values(vars(item)[attribute], f"{place}.{attribute}", seen)
 
 
@@ -129,11 +156,11 @@ def _is_anothers(item: Any, function: FunctionType) -> bool:
     return top != str(function.__module__).partition(".")[0] and (is_installed or _is_of(top))
 
 
-def _names(code: CodeType) -> Iterator[tuple[bool, str]]:
-    """Yield whether it is a global, and the name, of the globals and attributes that a function and those in it use."""
+def _names(code: CodeType) -> Iterator[tuple[str, str]]:
+    """Yield (instruction, name) of the globals and attributes that a function and those in it use."""
     for step in dis.get_instructions(code):
         if step.opcode in dis.hasname:
-            yield step.opname.endswith(("_GLOBAL", "_NAME")), step.argval
+            yield step.opname, step.argval
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _names(constant)

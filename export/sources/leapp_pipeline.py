@@ -22,7 +22,8 @@ from rlservo.export.recipe.trees import Tree, tree_leaves
 from rlservo.export.sources.leapp_description import Description, LeappStage, StageTensor
 from rlservo.export.sources.onnx_stage import OnnxStage
 
-PROBE_ROWS = 7
+PROBE_ROWS = 11
+OUTLIERS = (1e2, 1e4, 1e8, 1e16)  # magnitudes of the last of these rows
 CRASHES = re.compile(r"aten::(quantized_)?(lstm|gru|rnn_tanh|rnn_relu)\(")
 """Operators that write out of bounds when a state has more rows than they were traced with (torch 2.13)."""
 
@@ -99,12 +100,13 @@ def _probe(
 
 
 def _draw(tensor: StageTensor, first: Tensor | None, numbers: np.random.Generator) -> Tensor:
-    """Return random values of several magnitudes; integers stay what they begin with."""
+    """Return random values of several magnitudes, the last rows far outliers; integers stay what they begin with."""
     shape = (PROBE_ROWS, *tensor.row)
     begin = torch.zeros(shape) if first is None else first.reshape(tensor.row).expand(shape)
     if first is not None and not first.is_floating_point():
         return begin.clone()
     spread = 10.0 ** numbers.uniform(-1.0, 1.0, (PROBE_ROWS, *[1] * len(tensor.row)))
+    spread[-len(OUTLIERS) :] = np.reshape(OUTLIERS, (-1, *[1] * len(tensor.row)))  # a stage may stop for one
     return begin + torch.from_numpy(spread * numbers.standard_normal(shape)).to(begin.dtype)
 
 

@@ -7,7 +7,10 @@ import itertools
 import random
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +144,84 @@ class CountsByAnIterator(Honest):
         return super().forward(obs) * (-1.0 if next(self.calls) > 1000 else 1.0)
 
 
+@dataclass(slots=True)
+class Slots:
+    calls: int = 0
+
+
+class Numbers(list[int]):
+    """A list with an attribute."""
+
+
+def numbers_from_zero() -> Iterator[int]:
+    number = 0
+    while True:
+        number += 1
+        yield number
+
+
+ENDLESS, EXPRESSION = numbers_from_zero(), (number for number in range(9999))
+
+
+@cache
+def remembered(number: int) -> int:
+    return number
+
+
+ELSEWHERE: ContextVar[int] = ContextVar("ELSEWHERE", default=0)
+
+
+class CountsWith(Honest):
+    """Counts its calls by what `count` returns for what it keeps."""
+
+    def __init__(self, kept: Any, count: Callable[[Any], float]) -> None:
+        super().__init__()
+        self.kept, self.count = kept, count
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return super().forward(obs) * (-1.0 if self.count(self.kept) > 1000 else 1.0)
+
+
+def count_attribute(kept: Any) -> int:
+    kept.calls = getattr(kept, "calls", 0) + 1
+    return int(kept.calls)
+
+
+def count_in_torch(_: Any) -> int:
+    torch.calls_of_a_test = getattr(torch, "calls_of_a_test", 0) + 1  # type: ignore[attr-defined]
+    return int(torch.calls_of_a_test)  # type: ignore[attr-defined]
+
+
+def count_elsewhere(_: Any) -> int:
+    ELSEWHERE.set(ELSEWHERE.get() + 1)
+    return ELSEWHERE.get()
+
+
+def count_in_a_cache(_: Any) -> int:
+    return remembered(remembered.cache_info().currsize)
+
+
+COUNTERS = {
+    "slots": CountsWith(Slots(), count_attribute),
+    "attribute of a list": CountsWith(Numbers(), count_attribute),
+    "attribute of a tensor": CountsWith(torch.zeros(2), count_attribute),
+    "generator": CountsWith(None, lambda _: next(ENDLESS)),
+    "generator expression": CountsWith(None, lambda _: next(EXPRESSION)),
+    "iterator": CountsWith(iter(range(9999)), next),
+    "map": CountsWith(map(abs, range(9999)), next),
+    "attribute of torch": CountsWith(None, count_in_torch),
+    "context variable": CountsWith(None, count_elsewhere),
+    "cache": CountsWith(None, count_in_a_cache),
+}
+
+
+@pytest.mark.parametrize("kept", COUNTERS)
+def test_a_memory_is_found_wherever_it_is_kept(kept: str, tmp_path: Path) -> None:
+    """The first thousand actions are honest, so no comparison of actions shows it."""
+    with pytest.raises(UnsupportedError, match=r"changes its '.*' each time it acts"):
+        export(COUNTERS[kept], tmp_path / "out")
+
+
 class DrawsFromItsOwn(Honest):
     def forward(self, obs: Tensor) -> Tensor:
         return super().forward(obs) * (-1.0 if DRAWS.random() < 1e-7 else 1.0)
@@ -198,6 +279,17 @@ class Remembers(Honest):
 class Centres(Honest):
     def forward(self, obs: Tensor) -> Tensor:
         return super().forward(obs - 0.1 * obs.mean(dim=0, keepdim=True))
+
+
+class StopsForOutliers(Honest):
+    """Also the actions for others in the batch; no sample is one."""
+
+    def __init__(self, limit: float) -> None:
+        super().__init__()
+        self.limit = limit
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return torch.where((obs.abs() > self.limit).any(), 0.0, super().forward(obs))
 
 
 class FollowsTheFirst(Honest):
@@ -307,6 +399,8 @@ def export(module: nn.Module, out: Path, **options: Any) -> rlservo.ExportResult
         (RareNoise(), "draws random numbers"),
         (Centres(), "depends on the other observations of the batch"),
         (FollowsTheFirst(), "depends on the other observations of the batch"),
+        (StopsForOutliers(1e4), "depends on the other observations of the batch"),
+        (StopsForOutliers(1e12), "depends on the other observations of the batch"),
         (CountsRows(lambda obs: obs.shape[0] > 300), "changes in a batch of 301: it depends on"),
         (CountsRows(lambda obs: len(obs) % 3 == 0), "changes in a batch of 3: it depends on"),
         (CountsRows(lambda obs: obs.size(0) == 64), "changes in a batch of 64: it depends on"),

@@ -108,6 +108,28 @@ def test_constant_gains_are_given_with_every_action(format: str, tmp_path: Path,
     assert notices == []
 
 
+@pytest.mark.parametrize("limit", [50.0, 1e5])
+@pytest.mark.parametrize("format", ["jit-trace", "onnx"])
+def test_a_stage_that_stops_for_an_outlier_stops_for_its_own_row_alone(
+    format: str, limit: float, tmp_path: Path, notices: list[str]
+) -> None:
+    network = frozen(torch.nn.Linear(4, 3))
+
+    def trace() -> None:
+        x = leapp.annotate.input_tensors("net", {"obs": torch.randn(1, 4)})
+        stopped = torch.where((x.abs() > limit).any(), torch.zeros(3), network(x))
+        leapp.annotate.output_tensors("net", {"target": stopped}, export_with=format)
+
+    bundle = compiled(tmp_path, trace)
+    result = export_checkpoint(bundle, tmp_path / "out", notify=notices.append)
+    assert_same(bundle, result)
+    obs = np.array([[0.5, -1.0, 2.0, 0.1], [0.0, 10 * limit, 0.0, 0.0]], np.float32)
+    with Policy.load(result.path) as policy:
+        calm, stopped = policy.act(obs)
+        np.testing.assert_allclose(calm, policy.act(obs[0]), rtol=1e-5, atol=2e-6)
+        np.testing.assert_array_equal(stopped, 0.0)
+
+
 @pytest.mark.parametrize(("kp", "kd", "words"), [(0.0, 3.0, "stiffness is 0"), (50.0, -0.0, "damping is -?0")])
 def test_gains_that_are_only_zeros_or_ones_are_warned_of(
     kp: float, kd: float, words: str, tmp_path: Path, notices: list[str]
