@@ -112,7 +112,8 @@ def promote(
         except RlservoError as error:  # nothing has begun, and 1 would mean that it was rolled back
             raise UsageError(error.message) from None
         except (SystemExit, KeyboardInterrupt) as ended:
-            terminal.note(f"stopped by a signal: the canary keeps running; the same command continues ({file})")
+            left = f"the canary keeps running; the same command continues ({file})"
+            terminal.note(f"stopped by a signal: {left if opened.has_begun else 'nothing was changed'}")
             raise typer.Exit(ended.code if isinstance(ended, SystemExit) else 130) from None  # type: ignore[arg-type]
     if as_json:
         print_json({"outcome": outcome.outcome, "why": outcome.why, "finished": outcome.is_finished, "log": str(file)})

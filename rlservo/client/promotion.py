@@ -153,7 +153,7 @@ class Promotion:
         if version not in (versions := policy.get("versions", ())):
             raise UsageError(
                 f"policy '{name}' has no version {version}: expected one of {', '.join(versions) or 'none'}; "
-                f"'rlservo policy load {name} {version}' loads it"
+                f"'rlservo policy load {name} {version}' loads one of the server's folder"
             )
         if policy["version"] == version:
             raise UsageError(f"version {version} of policy '{name}' is in production already")
@@ -172,9 +172,10 @@ class Promotion:
         """Start the shadow and the canary. Raises RlservoError."""
         for use, document in reversed(self._uses.items()):
             self._change(use, document)
+        living = [name for name, numbers in self._state.counts.seen.items() if not has_ended(numbers)]
         self.say(
             f"watching version {self.terms.version} of '{self.terms.policy}' against {self._state.production} for "
-            f"{self.terms.seconds:.0f} s on {', '.join(self._state.counts.seen)}; the log is {self.log.path}"
+            f"{self.terms.seconds:.0f} s on {', '.join(living)}; the log is {self.log.path}"
         )
 
     def _resume(self) -> bool:

@@ -27,6 +27,11 @@ class PromotionLog:
         file.truncate(len(content) - len(torn))
         self.last = lines[-1] if lines else b""
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether the log ends with a promotion that has not ended."""
+        return bool(self.last) and json.loads(self.last).get("event") != "end"
+
     @classmethod
     @contextlib.contextmanager
     def open(cls, path: Path) -> Iterator[PromotionLog]:
@@ -51,7 +56,8 @@ class PromotionLog:
     def write(self, event: str, fields: dict[str, Any]) -> None:
         """Append a line and sync it to disk: the next step may not be undone. Raises UsageError."""
         entry = {"time": datetime.now(timezone.utc).isoformat(timespec="milliseconds"), "event": event} | fields
-        content, size = json.dumps(entry).encode() + b"\n", os.fstat(self._file.fileno()).st_size
+        self.last = line = json.dumps(entry).encode()
+        content, size = line + b"\n", os.fstat(self._file.fileno()).st_size
         try:
             while content:
                 content = content[self._file.write(content) :]

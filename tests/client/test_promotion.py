@@ -465,6 +465,15 @@ def test_an_alias_that_is_moved_in_the_last_moment_is_not_moved_back(
     assert server.state == ("4", None, None)
 
 
+def test_a_log_tells_whether_a_promotion_has_begun(tmp_path: Path) -> None:
+    for _ in range(2):
+        with PromotionLog.open(tmp_path / "log.jsonl") as log:
+            assert not log.has_begun
+            log.write("start", {})
+            assert log.has_begun
+            log.write("end", {})
+
+
 @pytest.mark.parametrize(
     ("version", "says"),
     [("9", "has no version 9: expected one of 1, 2, 3, 4"), ("1", "in production already")],
