@@ -65,6 +65,11 @@ def test_the_rules_are_well_formed_and_fire_when_they_should(promtool: str) -> N
     assert fired == {rule["alert"] for rule in RULES}
 
 
+def test_every_panel_shows_the_servers_that_are_chosen() -> None:
+    series = [named for query in QUERIES for named in re.findall(r"rlservo_\w+(\{[^}]*\})?", query)]
+    assert len(series) >= len(QUERIES) and all('instance=~"$instance"' in labels for labels in series)
+
+
 def test_the_rules_name_codes_that_there_are() -> None:
     named = {
         code for rule in RULES for codes in re.findall(r'code=~"([^"]*)"', rule["expr"]) for code in codes.split("|")
@@ -192,7 +197,7 @@ def scraped(prometheus: Prometheus, live_server: LiveServer) -> Iterator[Prometh
 
 @pytest.mark.parametrize("expression", QUERIES)
 def test_every_query_of_the_dashboard_has_series(scraped: Prometheus, expression: str) -> None:
-    asked = expression.replace("$__rate_interval", WINDOW).replace('"$policy"', '".*"')
+    asked = expression.replace("$__rate_interval", WINDOW).replace('"$policy"', '".*"').replace('"$instance"', '".*"')
     assert "$" not in asked
     assert scraped.query(asked), asked
 
