@@ -219,7 +219,7 @@ def robot_latency(
     ur_model: Annotated[str, typer.Option(help=f"Model: {MODELS}.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
-    hours: Annotated[float, typer.Option(min=0.0, help="Measure at least for so long: half an hour shows more.")] = 0.0,
+    hours: Annotated[float, typer.Option(min=0.0, help="Go on for at least so many hours: rare delays need it.")] = 0.0,
     limit: Limit = None,
     yes: Annotated[bool, typer.Option("--yes", help="Move without confirmation.")] = False,
     as_json: Json = False,

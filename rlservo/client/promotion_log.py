@@ -56,7 +56,7 @@ class PromotionLog:
     def write(self, event: str, fields: dict[str, Any]) -> None:
         """Append a line and sync it to disk: the next step may not be undone. Raises UsageError."""
         entry = {"time": datetime.now(timezone.utc).isoformat(timespec="milliseconds"), "event": event} | fields
-        self.last = line = json.dumps(entry).encode()
+        line = json.dumps(entry).encode()
         content, size = line + b"\n", os.fstat(self._file.fileno()).st_size
         try:
             while content:
@@ -65,3 +65,4 @@ class PromotionLog:
         except OSError as error:  # for example a full disk, which may have taken half of it
             self._file.truncate(size)
             raise UsageError(f"the log {self.path} cannot be written: {error.strerror}") from None
+        self.last = line

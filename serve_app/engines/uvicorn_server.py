@@ -55,6 +55,7 @@ logger = logging.getLogger(__name__)
 KEEP_ALIVE_S = 90  # [s] that a connection may be idle
 DRAIN_S = 15  # [s] for requests in progress when the server stops
 HUNG_S = 30  # [s] until an unresponsive worker is replaced; a start on a busy machine takes as long
+PATIENCE_S = 10  # [s] until a start that takes longer is logged
 EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
 DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a server at full load needs
 FEWEST_DESCRIPTORS = 64  # with fewer no connection may be left
@@ -351,19 +352,31 @@ class _Supervisor(Multiprocess):
             self._on_ready = None
 
     def restart_all(self) -> None:
-        """Replace each worker, the next one when the new one answers requests, unless one does not start."""
-        for index, old in enumerate(self.processes):
-            new = Process(self.config, self.sockets)
+        """Replace each worker, the next one when the new one answers requests, unless one does not start.
+
+        Workers that die meanwhile are replaced too: to load policies may take minutes.
+        """
+        for index in range(len(self.processes)):
+            new, began, is_said = Process(self.config, self.sockets), time.monotonic(), False
             new.start()
             while not _started(new.pid).exists():
-                if new.exitcode is not None or self._is_told_to_stop():
+                is_ending = self.should_exit.is_set() or self._is_told_to_stop()
+                if new.exitcode is not None or is_ending:
                     new.kill()
                     new.join()
-                    if not self._is_told_to_stop():
-                        logger.error("new worker %s could not start: worker %s stays", new.pid, old.pid)
+                    if not is_ending:
+                        logger.error(
+                            "new worker %s could not start: worker %s stays", new.pid, self.processes[index].pid
+                        )
                     return
+                if not is_said and time.monotonic() - began > PATIENCE_S:
+                    is_said = True
+                    logger.warning(
+                        "new worker %s still starts: worker %s serves on", new.pid, self.processes[index].pid
+                    )
                 time.sleep(0.1)
-            self.processes[index] = new
+                self.keep_subprocess_alive()
+            old, self.processes[index] = self.processes[index], new
             old.terminate()
             old.join()
 

@@ -244,6 +244,24 @@ def test_sighup_keeps_workers_that_new_ones_cannot_replace(box_policy: Callable[
 
 @pytest.mark.serve
 @pytest.mark.slow
+def test_a_worker_that_dies_during_a_slow_replacement_is_replaced_too(policies: Path) -> None:
+    with launched(policies, workers=2) as run:
+        run.wait_until_ready()
+        before = set(worker_pids(run))
+        run.process.send_signal(signal.SIGHUP)
+        wait_for(lambda: set(worker_pids(run)) - before, "the first new worker")
+        (slow,) = set(worker_pids(run)) - before
+        os.kill(slow, signal.SIGSTOP)
+        os.kill(max(before), signal.SIGKILL)
+        wait_for(lambda: set(worker_pids(run)) - before - {slow}, "another in place of the dead one", timeout_s=60)
+        wait_for(lambda: f"new worker {slow} still starts" in "".join(run.output), "the sentence that it takes long")
+        os.kill(slow, signal.SIGCONT)
+        wait_for(lambda: not before & set(now := worker_pids(run)) and len(now) == 2, "new workers", poll_s=0.2)
+        assert run.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.serve
+@pytest.mark.slow
 def test_workers_whose_parent_was_killed_end_themselves(policies: Path) -> None:
     with launched(policies, workers=2) as run:
         run.wait_until_ready()
