@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -19,9 +19,6 @@ def compile(
     cc: Annotated[
         str | None, typer.Option(help="C compiler for the proof; $CC or the machine's own by default.")
     ] = None,
-    embed_weights: Annotated[
-        Literal["c", "bin"], typer.Option(help="Weights in the C file, or in a binary file beside it (large networks).")
-    ] = "c",
     version: Version = None,
     as_json: Json = False,
 ) -> None:
@@ -37,12 +34,12 @@ def compile(
 
     chosen = bundle_of(bundle, version)
     with terminal.status("importing") as show, terminal.ends_like_ctrl_c():
-        made = compile_bundle(chosen, out, compiler=cc, weights_in_file=embed_weights == "bin", progress=show)
+        made = compile_bundle(chosen, out, compiler=cc, progress=show)
     if as_json:
         print_json({"path": str(made.folder), **made.about})
         return
     proof = made.proof
-    lines = [f"written   {made.folder}: {made.about['prefix']}.c, .h, _test.c, CMakeLists.txt"]
+    lines = [f"written   {made.folder}: {made.about['prefix']}.c, .h, _test.c"]
     if proof is None:
         lines.append(f"unproven  {made.about['unproven']}")
     else:

@@ -1,4 +1,4 @@
-// ros2_control controller (Humble, Jazzy) around a policy of `rlservo compile`: link `ur5::ur5`.
+// ros2_control controller (Humble, Jazzy) around a policy of `rlservo compile`: add `ur5.c` to its library.
 // Nothing in `update` allocates or waits.
 #include <string>
 

@@ -157,23 +157,13 @@ class Program:
         lines = [*pointers, *loops, f"    {body.format(*names, y=f'y[{index(strides[-1])}]')}"]
         self.emit("{\n" + "\n".join(f"    {line}" for line in lines) + "\n}")
 
-    def constants_text(self, prefix: str, least_in_file: int | None) -> tuple[str, NDArray[np.float32] | None]:
-        """Return (definitions of the array constants, those that go into a file of weights instead).
-
-        The file takes single-precision ones of at least `least_in_file` elements; with None there is no file.
-        """
-        lines: list[str] = []
-        outside: list[NDArray[np.float32]] = []
-        for name, array in self._constants.values():
-            if least_in_file is not None and array.dtype == np.float32 and array.size >= least_in_file:
-                lines.append(f"#define {name} ({prefix}_weights + {sum(each.size for each in outside)})")
-                outside.append(np.pad(array.ravel(), (0, -array.size % ALIGN)))
-            else:
-                values = array_text(array) if array.size else "    0"
-                lines.append(
-                    f"static const {c_type(array.dtype)} {name}[{max(array.size, 1)}] ALIGNED = {{\n{values}\n}};"
-                )
-        return "\n".join(lines), np.concatenate(outside) if outside else None
+    def constants_text(self) -> str:
+        """Return the definitions of the array constants."""
+        return "\n".join(
+            f"static const {c_type(array.dtype)} {name}[{max(array.size, 1)}] ALIGNED = {{\n"
+            f"{array_text(array) if array.size else '    0'}\n}};"
+            for name, array in self._constants.values()
+        )
 
 
 def row_major(shape: Sequence[int]) -> list[int]:

@@ -19,19 +19,16 @@ from rlservo.export.compiled.names import C_TYPES, array_text, comment, number, 
 from rlservo.export.compiled.static_graph import StaticGraph
 from rlservo.policy.input_numbers import rounding_slack
 
-SMALLEST_IN_BIN = 256  # elements of a constant that goes into the file of weights, if there is one
-
 
 @dataclass(frozen=True)
 class CSource:
-    """The C file, the scratch memory its state needs, and the weights that it takes from a file of their own."""
+    """The C file, and the scratch memory its state needs."""
 
     text: str
     scratch: dict[str, int]
-    weights: NDArray[np.float32] | None
 
 
-def write_source(face: Interface, contract: Contract, graph: StaticGraph, *, weights_in_file: bool) -> CSource:
+def write_source(face: Interface, contract: Contract, graph: StaticGraph) -> CSource:
     """Return the C file. Raises UnsupportedError, naming an operator."""
     outputs = [(member, "action", member.tensor) for member in face.action]
     outputs += [(member, "state", f"state_out.{member.tensor}") for member in face.state]
@@ -50,8 +47,6 @@ def write_source(face: Interface, contract: Contract, graph: StaticGraph, *, wei
             _check_action(program, face, member, f"({result})[i]")
     program.emit("\n".join(copies))
     p, u = face.prefix, face.upper
-    constants, weights = program.constants_text(p, SMALLEST_IN_BIN if weights_in_file else None)
-    embedded = WEIGHTS.replace("@NAME@", p).replace("@SIZE@", str(weights.size)) if weights is not None else ""
     text = f"""\
 /* Policy '{comment(contract.name)}', version {contract.version}, compiled by rlservo. {p}.h says how to call it. */
 #include "{p}.h"
@@ -75,7 +70,7 @@ def write_source(face: Interface, contract: Contract, graph: StaticGraph, *, wei
 const char {p}_bundle[] = {u}_BUNDLE;
 const size_t {p}_state_size = sizeof({p}_state);
 
-{embedded}{constants}
+{program.constants_text()}
 
 {_kernels(program.kernels)}{_reset(face, contract)}
 int32_t {p}_act(const {p}_obs *obs, {p}_state *state, {p}_action *action) {{
@@ -86,23 +81,7 @@ int32_t {p}_act(const {p}_obs *obs, {p}_state *state, {p}_action *action) {{
 }}
 
 {_names(face)}"""
-    return CSource(text, program.scratch, weights)
-
-
-WEIGHTS = """\
-/* The weights are the file @NAME@_weights.bin, which the assembler finds with -I for its folder. */
-#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
-#error "the weights are little-endian"
-#endif
-#ifdef __APPLE__
-__asm__(".const\\n.globl _@NAME@_weights\\n.p2align 6\\n_@NAME@_weights:\\n"
-        ".incbin \\"@NAME@_weights.bin\\"\\n.text\\n");
-#else
-__asm__(".section .rodata\\n.globl @NAME@_weights\\n.balign 64\\n@NAME@_weights:\\n"
-        ".incbin \\"@NAME@_weights.bin\\"\\n.previous\\n");
-#endif
-extern const float @NAME@_weights[@SIZE@];
-"""
+    return CSource(text, program.scratch)
 
 
 def _kernels(wanted: set[str]) -> str:

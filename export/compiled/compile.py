@@ -1,4 +1,4 @@
-"""Bundle as one C file with header, self-test and build files, proven if there is a compiler: `rlservo compile`."""
+"""Bundle as one C file with header and self-test, proven if there is a compiler: `rlservo compile`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ import numpy as np
 
 from rlservo.bundle.bundle import CONTRACT_FILE, ONNX_FILE, load_bundle
 from rlservo.errors import UsageError
-from rlservo.export.compiled.build_files import build_files
 from rlservo.export.compiled.c_source import write_source
 from rlservo.export.compiled.interface import header_text, interface_of
 from rlservo.export.compiled.moved_weights import MovedGraph
@@ -48,14 +47,13 @@ def compile_bundle(
     out: str | Path,
     *,
     compiler: str | None = None,
-    weights_in_file: bool = False,
     progress: Callable[[str], object] = lambda _: None,
 ) -> Compiled:
     """Write the bundle at `path` as C into the folder `out`, all of it or nothing.
 
-    `compiler` is the one to prove it with ($CC or the machine's own by default); `weights_in_file` puts the weights
-    into a binary file beside the C. Raises what `Policy.load` does for a bundle, UnsupportedError for an operator
-    without C code, ParityError if the compiled policy differs from onnxruntime, and UsageError.
+    `compiler` is the one to prove it with ($CC or the machine's own by default). Raises what `Policy.load` does for a
+    bundle, UnsupportedError for an operator without C code, ParityError if the compiled policy differs from
+    onnxruntime, and UsageError.
     """
     folder, chosen = Path(out), find_compiler(compiler)
     progress("reading the bundle")
@@ -70,7 +68,7 @@ def compile_bundle(
         model = file.read_bytes()
     wanted = [tensor.name for tensor in acting_contract(contract).outputs]
     graph = read_static_graph(model, wanted, {tensor.name: golden[tensor.name][:1] for tensor in contract.inputs})
-    source = write_source(face, contract, graph, weights_in_file=weights_in_file)
+    source = write_source(face, contract, graph)
     rng = np.random.default_rng(2)
     moved_graphs = [MovedGraph(model, rng) for _ in range(MOVED)]
     moved = [graph(moved_inputs(golden, rng)) for graph in moved_graphs]
@@ -79,15 +77,12 @@ def compile_bundle(
         f"{face.prefix}.c": source.text,
         f"{face.prefix}.h": header_text(face, contract, bundle.digest, source.scratch),
         f"{face.prefix}_test.c": self_test_text(face, golden, recorded, allowed, refused),
-        **build_files(face.prefix, contract.version),
     }
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".rlservo-compile-", dir=folder.parent) as name:
         beside = Path(name)
         for file_name, text in texts.items():
             (beside / file_name).write_text(text, encoding="utf-8")
-        if source.weights is not None:
-            (beside / f"{face.prefix}_weights.bin").write_bytes(source.weights.astype("<f4").tobytes())
         shutil.copyfile(bundle.path / CONTRACT_FILE, beside / CONTRACT_FILE)
         proof, library = None, None
         if chosen is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -95,21 +96,26 @@ def test_a_wrong_weight_is_no_rounding(kind: str, fault: str, tmp_path: Path, mo
     written = proof.build
 
     def build(compiler: str, folder: Path, prefix: str, library: str) -> tuple[str, ...]:
-        file = folder / f"{prefix}_weights.bin"
-        values = np.fromfile(file, "<f4")
-        largest = int(np.abs(values).argmax())
+        file = folder / f"{prefix}.c"
+        text = file.read_text()
+        tables = re.findall(r"\bweights_\d+\[\d+\] ALIGNED = {\n(.*?)\n};", text, re.DOTALL)
+        values = [[float.fromhex(each.rstrip("f")) for each in re.findall(r"[^\s,]+", table)] for table in tables]
+        place, most = max(enumerate(values), key=lambda item: max(map(abs, item[1])))
+        largest = max(range(len(most)), key=lambda i: abs(most[i]))
         if fault == "a weight of 1%":
-            values[largest] *= 1.01
+            most[largest] *= 1.01
         elif fault == "another bias":
-            values[0] += 1.0  # a layer's stream begins with its bias
+            place, most = 0, values[0]
+            most[0] += 1.0  # a layer's stream begins with its bias
         else:
-            values[[largest, largest + 8]] = values[[largest + 8, largest]]
-        values.tofile(file)
+            other = largest + (8 if largest + 8 < len(most) else -8)
+            most[largest], most[other] = most[other], most[largest]
+        file.write_text(text.replace(tables[place], ", ".join(f"{each.hex()}f" for each in most)))
         return written(compiler, folder, prefix, library)
 
     monkeypatch.setattr(proof, "build", build)
     with pytest.raises(ParityError, match=r"does not reproduce the golden vectors|observation \d+: output 'action'"):
         compile_bundle(
             bundle(tmp_path / "image" / "1", SHAPES[kind][0], network(*SHAPES[kind], 4.0)),
-            tmp_path / "c", weights_in_file=True,
-        )  # fmt: skip
+            tmp_path / "c",
+        )
