@@ -32,6 +32,7 @@ from rlservo.deploy.commands.robot_server import robot_latency, robot_server, se
 from rlservo.deploy.commands.rollout import rollout
 from rlservo.deploy.commands.ros2 import ros2, ros2_sim
 from rlservo.deploy.commands.serve import serve
+from rlservo.deploy.commands.sign import sign
 from rlservo.deploy.commands.verify import verify
 from rlservo.errors import RlservoError, UsageError
 
@@ -79,6 +80,7 @@ for command in (
     inspect,
     verify,
     compile,
+    sign,
     publish,
     learn,
     serve,

@@ -40,6 +40,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "learn nowhere --policy ur5 --repository r --recordings r --out o": ("train", "client", "record"),
     "publish {bundle} s3://127.0.0.1/bucket": ("remote",),
     "publish {bundle} hf://owner/name": ("hub",),
+    "sign {bundle} --key {bundle}/contract.json": ("sign",),
     "cockpit --robot-server 127.0.0.1:1": ("cockpit",),
     "rollout rlservo/EndEffectorPositioningURRob-v0 --bundle {bundle} --env-arg robot=rtde://127.0.0.1": ("ur", "sim"),
     "rollout rlservo/NoObstacleNavigationMir100Rob-v0 --bundle {bundle} --env-arg robot=rosbridge://127.0.0.1": (

@@ -89,6 +89,9 @@ def serve(
             help="Storage of sessions by id; several workers need redis://HOST:PORT/DATABASE.",
         ),
     ] = None,
+    require_signature: Annotated[
+        Path | None, typer.Option(metavar="KEYS", help="Serve only what a key of this folder signed (`rlservo sign`).")
+    ] = None,
     config: ConfigOption = None,
     versions: VersionsOption = None,
     alias: AliasOption = None,
@@ -133,6 +136,7 @@ def serve(
                 ("record", record and str(record)),
                 ("poll_s", poll),
                 ("session_store", session_store),
+                ("require_signature", require_signature and str(require_signature)),
             )
             if value is not None
         },

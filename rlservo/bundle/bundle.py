@@ -124,9 +124,10 @@ class Bundle:
 
         On Linux it is in no folder and gone with this process. Raises BundleError, BundleTamperedError.
         """
+        recorded = self.digest if name == SUMS_FILE else self.sums[name]
         with _private_file() as (copy, path):
             try:
-                for block in _verified(self.path / name, self.sums[name], self.limits):
+                for block in _verified(self.path / name, recorded, self.limits):
                     copy.write(block)
                 copy.flush()
             except OSError as error:  # from writing: a BundleError is not an OSError

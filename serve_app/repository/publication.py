@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rlservo.bundle.bundle import SUMS_FILE, Bundle, digest_of
 from rlservo.bundle.contract import VERSION_PATTERN, version_key
@@ -21,7 +22,11 @@ from rlservo.errors import BundleError, ConflictError, UnavailableError, UsageEr
 from rlservo.serve_app.repository.hub_storage import HubStorage
 from rlservo.serve_app.repository.index import INDEX, Index, check_file_type
 from rlservo.serve_app.repository.places import place_of
+from rlservo.serve_app.repository.signature import MAX_SIGNATURE_BYTES, SIGNATURE_FILE
 from rlservo.serve_app.repository.storage import FolderStorage, storage_at
+
+if TYPE_CHECKING:
+    from rlservo.serve_app.repository.object_storage import ObjectStorage
 
 ATTEMPTS = 20  # at the index, each after others have published
 
@@ -29,9 +34,10 @@ ATTEMPTS = 20  # at the index, each after others have published
 def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[str], object] = str) -> str:
     """Publish a bundle to a folder or URI under its own name and version; return where it is: on a hub, the commit.
 
-    `card` is the README.md of a hub's repository. `progress` gets a line per uploaded file. Raises ConflictError if
-    that version is there, or is being published, UsageError if nothing can be written, UnavailableError if the
-    storage fails, and BundleError.
+    This very bundle may be there already: then its signature is published, if that is another one. `card` is the
+    README.md of a hub's repository. `progress` gets a line per uploaded file. Raises ConflictError if that version is
+    there, or is being published, UsageError if nothing can be written, UnavailableError if the storage fails, and
+    BundleError.
     """
     storage = storage_at(place_of(place))
     is_hub = isinstance(storage, HubStorage)
@@ -47,6 +53,9 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
             {f"{bundle.contract.name}/{bundle.contract.version}/{f}": copy for f, copy in _files(bundle)}, card
         )
     index, tag = Index.read(storage)
+    if index.hash_of(bundle) == bundle.digest and (bundle.path / SIGNATURE_FILE).exists():
+        _publish_signature(storage, bundle, target)
+        return storage.pinned if isinstance(storage, HubStorage) else target
     content = _with(index, bundle, target)
     if isinstance(storage, FolderStorage):
         _place(bundle, Path(target))
@@ -69,6 +78,21 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
     raise UnavailableError(f"{storage.uri}/{INDEX}: others keep publishing; run the same command again")
 
 
+def _publish_signature(storage: ObjectStorage | HubStorage | FolderStorage, bundle: Bundle, target: str) -> None:
+    """Publish the signature of a bundle that is published: the first one, or one by another key.
+
+    Raises ConflictError if that very one is published, and what `publish` raises.
+    """
+    name = f"{bundle.contract.name}/{bundle.contract.version}/{SIGNATURE_FILE}"
+    signature, there, tag = (bundle.path / SIGNATURE_FILE).read_bytes(), b"", ""
+    with contextlib.suppress(FileNotFoundError):
+        there, tag = storage.read(name, MAX_SIGNATURE_BYTES)
+    if there == signature:
+        raise ConflictError(f"{target} is there already (this very bundle, with this signature)")
+    if not storage.create(name, signature, tag):
+        raise UnavailableError(f"{target}/{SIGNATURE_FILE}: others keep publishing; run the same command again")
+
+
 def next_version(place: str, name: str) -> str:
     """Return the integer after the newest version at a folder or URI; one that was begun is not free.
 
@@ -80,12 +104,14 @@ def next_version(place: str, name: str) -> str:
 
 
 def _files(bundle: Bundle) -> Iterator[tuple[str, bytes]]:
-    """Yield the name and content of each file, the one with the hashes first. Raises BundleError."""
+    """Yield the name and content of each file: the hashes first, a signature last. Raises BundleError."""
     for name, digest in {SUMS_FILE: bundle.digest, **bundle.sums}.items():
         content = (bundle.path / name).read_bytes()
         if hashlib.sha256(content).hexdigest() != digest:
             raise BundleError(f"{bundle.path / name} changed while it was published")
         yield name, content
+    with contextlib.suppress(FileNotFoundError):
+        yield SIGNATURE_FILE, (bundle.path / SIGNATURE_FILE).read_bytes()
 
 
 def _with(index: Index, bundle: Bundle, target: str) -> bytes:

@@ -8,6 +8,8 @@ indefinitely if a file system hangs: `versions/version_loader.py` calls it throu
 from __future__ import annotations
 
 import contextlib
+import logging
+import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -40,6 +42,7 @@ from rlservo.errors import (
 from rlservo.serve_app.repository.bundle_cache import BundleCache
 from rlservo.serve_app.repository.index import INDEX, Index, check_file_type
 from rlservo.serve_app.repository.places import TIMEOUT_S, place_of
+from rlservo.serve_app.repository.signature import MAX_SIGNATURE_BYTES, SIGNATURE_FILE, check_signature, trusted
 from rlservo.serve_app.repository.storage import FolderStorage, storage_at
 
 if TYPE_CHECKING:
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
 
 Key = tuple[str, str]  # (name, version)
 CACHE_BYTES = 10 << 30
+logger = logging.getLogger(__name__)
 MAX_FILE_BYTES = 4 << 30  # where no limit is set
 
 
@@ -128,14 +132,21 @@ class Repository:
         cache: str | Path | None = None,
         cache_bytes: int = CACHE_BYTES,
         timeout_s: float = TIMEOUT_S,
+        keys: str | Path | None = None,
     ) -> None:
-        """Bundles behind URIs are fetched into the folder `cache`. Raises UsageError."""
+        """Bundles behind URIs are fetched into the folder `cache`; with `keys`, each must be signed by one of them.
+
+        Raises UsageError.
+        """
         given = [storage_at(place_of(place), timeout_s) for place in places]
         if not given:
             raise UsageError("no policy to serve: give at least one bundle folder")
         self._paths = [Path(storage.uri) for storage in given if isinstance(storage, FolderStorage)]
         self._storages = [storage for storage in given if not isinstance(storage, FolderStorage)]
         self._limits = limits
+        self._keys = Path(keys) if keys is not None else None
+        if self._keys is not None:
+            trusted(self._keys)
         self._seen: dict[tuple[str, str, str], Path] = {}
         """The folders of the last look, by name, version and hash."""
         if self._storages:
@@ -162,16 +173,19 @@ class Repository:
         """Give the folder of an accepted bundle, which stays until the block ends.
 
         Its files may have changed since: the loader compares every hash. Raises BundleTamperedError if the bundle of
-        that name and version has another hash by now, and what `Listing.find` raises if it cannot be served.
+        that name and version has another hash by now, what `Listing.find` raises if it cannot be served, and
+        BundleError if it is not signed as it must be.
         """
         listing, folder = Listing(), self._seen.get((name, version, digest))
         if folder is None or not _holds(folder, digest):  # a look at all others takes longer
             self._look_in_folders(listing)
             folder = self._seen.get((name, version, digest))
         if folder is not None:
+            self._check_signature(folder)
             yield folder
         elif self._storages:
             with self._cache.bundle(digest, partial(self._download, name, version, digest)) as fetched:
+                self._check_signature(fetched, f"{name}/{version}")
                 yield fetched
         else:
             listing.find(name, version)
@@ -181,6 +195,30 @@ class Repository:
         """Mark bundles as used in the cache: they are served."""
         if self._storages:
             self._cache.touch(digests)
+
+    def _check_signature(self, folder: Path, remote: str = "") -> None:
+        """Check who signed a bundle; `remote` is the folder that one in the cache was fetched from."""
+        if self._keys is None:
+            return
+        bundle = load_bundle(folder, self._limits)
+        try:
+            signer = check_signature(bundle, self._keys)
+        except BundleError:  # it may have been signed, or signed with another key, since
+            if not (remote and self._fetch_signature(folder, remote)):
+                raise
+            signer = check_signature(bundle, self._keys)
+        logger.info("policy '%s' version %s: signed by %s", bundle.contract.name, bundle.contract.version, signer)
+
+    def _fetch_signature(self, folder: Path, remote: str) -> bool:
+        """Replace the signature of a bundle in the cache by the published one; return whether there is one."""
+        for storage in self._storages:
+            with tempfile.TemporaryDirectory(dir=folder) as beside:
+                file = Path(beside, SIGNATURE_FILE)
+                with contextlib.suppress(FileNotFoundError), file.open("wb") as stream:
+                    storage.copy(f"{remote}/{SIGNATURE_FILE}", MAX_SIGNATURE_BYTES, stream)
+                    file.replace(folder / SIGNATURE_FILE)
+                    return True
+        return False
 
     def _download(self, name: str, version: str, digest: str, entry: Path) -> None:
         """Fetch a bundle from the first storage that has it.

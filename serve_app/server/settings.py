@@ -128,6 +128,11 @@ class ServerSettings(BaseModel):
     max_policy_bytes: int = Field(512 << 20, ge=1024)
     """A larger policy.onnx (or policy.ts) is refused before it is read. Loading takes about twice its size."""
 
+    require_signature: str | None = None
+    """Serve only bundles with a signature (`rlservo sign`) by a key of this folder: public keys, or certificates of
+    issuers, in `*.pem` files. It is read at each load, so keys can be added and removed while serving; what is loaded
+    stays. Also set by `rlservo serve --require-signature`."""
+
     plan: str | None = None
     """Folder or URI whose `.plan` holds the aliases, canaries and shadows. By default the first policy folder
     that is writable, else the user's state folder (`$XDG_STATE_HOME/rlservo`)."""
@@ -147,7 +152,7 @@ class ServerSettings(BaseModel):
     """[s] How often to look for new versions of policies and load them, as `rlservo policy load` does: ready but
     not in use. Off by default. Also set by `rlservo serve --poll`."""
 
-    @field_validator("api_keys_file", "audit_file", "log_file", "record", "cache")
+    @field_validator("api_keys_file", "audit_file", "log_file", "record", "cache", "require_signature")
     @classmethod
     def _absolute(cls, value: str | None) -> str | None:
         """A replica's working directory is not the caller's."""

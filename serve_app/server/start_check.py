@@ -60,7 +60,10 @@ async def not_served(control: PlanFollower) -> list[str]:
 def plan_follower(places: Sequence[str | Path], settings: ServerSettings) -> PlanFollower:
     """Return what serves these folders and URIs; nothing is read yet. Raises UsageError."""
     limits, cache, timeout_s = BundleLimits(settings.max_policy_bytes), settings.cache, settings.load_timeout_s
-    repository = Repository(places, limits, cache=cache, cache_bytes=settings.cache_bytes, timeout_s=timeout_s)
+    repository = Repository(
+        places, limits, cache=cache, cache_bytes=settings.cache_bytes, timeout_s=timeout_s,
+        keys=settings.require_signature,
+    )  # fmt: skip
     load = partial(Policy.load, threads=settings.threads, limits=limits)
     loader = VersionLoader(repository, load, options=settings.policy_options, timeout_s=timeout_s)
     return PlanFollower(loader, PlanFiles(places, root=settings.plan, cache=cache, timeout_s=timeout_s))
