@@ -6,6 +6,7 @@ Nothing here knows the arm's kinematics but the length from one published pose t
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -93,9 +94,10 @@ def test_tool_is_where_the_offset_puts_it(arm: OutsideArm) -> None:
         assert control.getActualToolFlangePose() == pytest.approx(flange, abs=1e-5)
         assert control.getForwardKinematics(receive.getActualQ(), TCP) == pytest.approx(tool, abs=1e-4)
         assert receive.getActualTCPPose()[:3] == pytest.approx(expected, abs=1e-4)
-        assert control.setPayload(1.5, [0.01, 0.02, 0.03])
-        arm.recorder.watch(0.1)
-        assert (receive.getPayload(), receive.getPayloadCog()) == (1.5, pytest.approx([0.01, 0.02, 0.03]))
+        for mass, call in ((1.5, control.setPayload), (2.5, partial(control.setTargetPayload, inertia=[0.01] * 6))):
+            assert call(mass, [0.01, 0.02, 0.03])
+            arm.recorder.watch(0.1)
+            assert (receive.getPayload(), receive.getPayloadCog()) == (mass, pytest.approx([0.01, 0.02, 0.03]))
     finally:
         control.stopScript()
         control.disconnect()

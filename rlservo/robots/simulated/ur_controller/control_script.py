@@ -199,4 +199,5 @@ COMMANDS: dict[int, Callable[[_ControlScript], Iterator[None] | None]] = {
     52: _ControlScript.free,
     53: _ControlScript.hold,
     58: _ControlScript.flange_pose,
+    65: _ControlScript.set_payload,  # and an inertia, which is not reported
 }
