@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import os
 import random
+import sys
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -152,6 +153,11 @@ class Transport:
         budget_s, response = deadline - time.monotonic(), Response()
         if self.label is not None:
             fields = b"%s%s: %s\r\n" % (fields, LABEL, self.label.encode())
+        if (tracing := sys.modules.get("opentelemetry.trace")) is not None:  # only if the caller uses it
+            span = tracing.get_current_span().get_span_context()
+            if span.is_valid:
+                parent = f"traceparent: 00-{span.trace_id:032x}-{span.span_id:016x}-{span.trace_flags:02x}\r\n"
+                fields += parent.encode()
         request = self._route.request(method, self._path + target.encode(), self._fields + fields, body)
         connection = self._connection(deadline, budget_s)
         is_kept = False

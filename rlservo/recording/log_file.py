@@ -212,6 +212,7 @@ def _details(record: DecisionRecord) -> list[bytes]:
             "latency_ms": None if record.latency_ms is None else round(record.latency_ms, 4),
             "seq": record.seq,
             "request_id": record.request_id,
+            "trace_id": record.trace_id,
             "warnings": list(record.warnings) or None,
             "error": record.error,
         }

@@ -252,6 +252,7 @@ def decision_schema(policy: PolicyFormat) -> dict[str, Any]:
             "latency_ms": {"type": "number", "description": "[ms]", "unit": "ms"},
             "seq": _integer("The request's number"),
             "request_id": _text("The request's id in the server's log"),
+            "trace_id": _text("The trace of the client's that it belongs to (W3C trace context)"),
             "warnings": {"type": "array", "items": {"type": "string"}},
             "error": _text("The error code instead of an action"),
         },

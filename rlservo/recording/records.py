@@ -42,6 +42,7 @@ class DecisionRecord:
     """The action from which a step limit counted, if the client sent it."""
     seq: int | None = None
     request_id: str | None = None
+    trace_id: str | None = None
     warnings: Sequence[str] = ()
     error: str | None = None
     """The error code if there was no action: deadline-passed, unavailable, bad-observation ..."""

@@ -38,7 +38,7 @@ from rlservo.serve_app.server.exposition import exposition
 from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.sessions.request import ClientGoneError
+from rlservo.serve_app.sessions.request import TRACEPARENT, ClientGoneError, trace_id
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 
 PROCESS = secrets.token_hex(8).encode()
@@ -113,6 +113,8 @@ class PolicyApp:
         found = self.table.find(method, path, headers.get(b"accept", b""))
         audit = AuditEntry(method, path, peer_of(scope), request_id.decode("latin-1"))
         own: Headers = () if self.is_behind_serve else ((REQUEST_ID, request_id),)
+        if trace_id(headers) is not None:
+            own = (*own, (TRACEPARENT, headers[TRACEPARENT]))
         call = Call(scope, receive, send, found.params, headers, own, audit)
         try:
             await self._admit(found, call)

@@ -150,6 +150,7 @@ class _Stream:
             time.perf_counter(),
             label=opening.label,
             request_id=opening.request_id,
+            headers=opening.headers,
             is_fresh=self._is_fresh,
             stream=opening.stream,
             stream_id=opening.stream_id,

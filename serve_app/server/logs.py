@@ -17,7 +17,7 @@ from rlservo.errors import UsageError
 from rlservo.serve_app.server.access_checks import READING
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.sessions.request import Request
+from rlservo.serve_app.sessions.request import Request, trace_id
 from rlservo.serve_app.versions.loaded_versions import Decision
 
 LOGGER = "rlservo"
@@ -107,6 +107,8 @@ def _fields(request: Request, policy: str, version: str | None, code: str, secon
         "code": code,
         "ms": round(seconds * 1e3, 3),
     }
+    if (trace := trace_id(request.headers)) is not None:
+        fields["trace_id"] = trace
     if request.stream_id is not None and request.seq is not None:
         fields["seq"] = request.seq
     return fields

@@ -32,9 +32,10 @@ from rlservo.serve_app.server.api_keys import A_KEY
 from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.current_keys import CurrentKeys
 from rlservo.serve_app.server.load_shedding import LoadShedding
-from rlservo.serve_app.server.logs import FIELDS, write_answer, write_failure
+from rlservo.serve_app.server.logs import FIELDS, OK, write_answer, write_failure
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.settings import MEMORY, ServerSettings
+from rlservo.serve_app.server.tracing import Tracing
 from rlservo.serve_app.sessions.request import ClientGoneError, Request, check_deadline
 from rlservo.serve_app.sessions.session_actions import Episodes
 from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore, blamed_version
@@ -103,6 +104,7 @@ class RequestHandler:
         )
         self.metrics = Metrics(replica)
         self.shadows = Shadows(self.metrics.record_differences)
+        self._tracing = Tracing() if settings.tracing else None
         self.recorder: RequestRecorder | None = None
         if settings.record is not None:
             from rlservo.serve_app.server.request_recorder import RequestRecorder  # which needs an extra
@@ -111,11 +113,12 @@ class RequestHandler:
             self.episodes.marks_states = True
 
     async def close(self) -> None:
-        """Close the connections to other services, and complete the recording."""
+        """Close the connections to other services, and complete the recording and the traces."""
         if self.episodes.store is not None:
             await self.episodes.store.close()
-        if self.recorder is not None:
-            await asyncio.to_thread(self.recorder.close)
+        for service in (self.recorder, self._tracing):
+            if service is not None:
+                await asyncio.to_thread(service.close)
 
     def store(self) -> PolicyStore:
         """Return the policies. Raises UnavailableError while they are being loaded."""
@@ -162,6 +165,8 @@ class RequestHandler:
             self._count_end(request, decision, request.final_status)
         if self.recorder is not None:
             self.recorder.note_answer(request, decision, taken)
+        if self._tracing is not None:
+            self._tracing.note(request, OK, decision.name, decision.version, taken, decision.infer_ms)
         if self.settings.log_requests:
             write_answer(request, decision, taken)
         return reply
@@ -200,6 +205,9 @@ class RequestHandler:
         else:  # an alias counts as its version, no version as the default
             version = store.default(name) if version is None else store.plans[name].version_of(version) or ""
         self.metrics.count_failure(request.protocol, name, version, counted_as)
+        if self._tracing is not None:
+            taken = time.perf_counter() - request.received
+            self._tracing.note(request, code, name or request.policy[:64], version or None, taken, None)
         write_failure(request, code, error.message if self.settings.log_values else None)
 
     def record_bug(self, request: Request, *, asked: str | None = None) -> None:
@@ -208,6 +216,9 @@ class RequestHandler:
         # Unless a version was asked: the policies themselves may have failed.
         name, version = ("", "") if asked is None else (request.policy, asked)
         self.metrics.count_failure(request.protocol, name, version, InternalError.code)
+        if self._tracing is not None:
+            taken = time.perf_counter() - request.received
+            self._tracing.note(request, InternalError.code, name, version or None, taken, None)
 
     @contextlib.contextmanager
     def open_stream(self, request: Request) -> Iterator[None]:

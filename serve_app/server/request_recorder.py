@@ -29,7 +29,7 @@ from rlservo.recording.policy_format import LeafArrays, PolicyFormat
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.sessions.request import Request, shorten_label
+from rlservo.serve_app.sessions.request import Request, shorten_label, trace_id
 from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore
 
 with needs_extra("record", what="recording"):
@@ -115,7 +115,7 @@ class RequestRecorder:
             return  # its action is not used
         record = DecisionRecord(
             known, obs, decision.action, episode, step, taken_s * 1e3, request.explore, seq=request.seq,
-            request_id=_request_id(request), warnings=decision.notices, rows=rows,
+            request_id=_request_id(request), trace_id=trace_id(request.headers), warnings=decision.notices, rows=rows,
         )  # fmt: skip
         if policy.has_step_limit and decision.last_action is not None:
             record.last_action_input = LeafArrays(decision.last_action)
@@ -149,7 +149,8 @@ class RequestRecorder:
         step = self._count(policy.contract.name, episode, request.begins) if episode else 0
         record = DecisionRecord(
             known, LeafArrays({name: array.copy() for name, array in arrays.items()}), None, episode, step, taken_ms,
-            request.explore, seq=request.seq, request_id=_request_id(request), error=code,
+            request.explore, seq=request.seq, request_id=_request_id(request), trace_id=trace_id(request.headers),
+            error=code,
         )  # fmt: skip
         self.recorder.record(record)
 

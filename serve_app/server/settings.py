@@ -102,6 +102,10 @@ class ServerSettings(BaseModel):
     log_values: bool = False
     """Log error messages, which may quote observations."""
 
+    tracing: bool = False
+    """Send a span of each request to OpenTelemetry's collector (`OTEL_EXPORTER_OTLP_ENDPOINT`; extra `tracing`), within
+    the client's trace if it sent `traceparent`."""
+
     session_store: str = Field(MEMORY, repr=False)  # the URL may hold a password
     """Storage of sessions that clients name by id: `memory` of the process, or for several workers or replicas
     `redis://[USER:PASSWORD@]HOST:PORT/DATABASE` (`rediss://` with TLS, `unix://` for a socket). Each server needs a

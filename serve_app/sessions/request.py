@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -18,6 +19,14 @@ SessionId: TypeAlias = str | int
 
 LONGEST_SESSION_ID = 128
 LONGEST_LABEL = LONGEST_SESSION_ID  # a header may have 16 KB
+TRACEPARENT = b"traceparent"
+_TRACE = re.compile(rb"(?!ff)[0-9a-f]{2}-(?!0{32})([0-9a-f]{32})-(?!0{16})[0-9a-f]{16}-[0-9a-f]{2}")
+
+
+def trace_id(headers: Mapping[bytes, bytes]) -> str | None:
+    """Return the id of the client's trace (W3C trace context); None if the header is absent or has another form."""
+    found = _TRACE.fullmatch(headers.get(TRACEPARENT, b""))
+    return None if found is None else found[1].decode()
 
 
 def new_episode_id(label: str | None) -> str:

@@ -131,11 +131,14 @@ def test_without_a_key_nothing_of_the_policies_is_told(engine: Engine) -> None:
 
 def test_replies_carry_the_requests_id_once(engine: Engine) -> None:
     body = json.dumps({"obs": OBS.tolist()}).encode()
-    status, headers, _ = engine.ask("POST", "/v1/policies/ur5/act", body, {"x-request-id": "robot-7-41"})
+    trace = "00-4bf92f3577b34da6a3ce929d0e0e4736-00f067aa0ba902b7-01"
+    given = {"x-request-id": "robot-7-41", "traceparent": trace}
+    status, headers, _ = engine.ask("POST", "/v1/policies/ur5/act", body, given)
     assert status == 200 and headers.get_all("x-request-id") == ["robot-7-41"]
+    assert headers.get_all("traceparent") == [trace]
     _, headers, _ = engine.ask("POST", "/v1/policies/ur5/act", body)
-    (given,) = headers.get_all("x-request-id") or ()
-    assert given
+    (made,) = headers.get_all("x-request-id") or ()
+    assert made and headers.get_all("traceparent") is None
 
 
 def test_a_key_in_a_trailer_is_no_key(engine: Engine) -> None:

@@ -42,7 +42,7 @@ from rlservo.serve_app.server.access_checks import LABEL, StreamKey, authorize, 
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
 from rlservo.serve_app.server.request_handler import RequestHandler
-from rlservo.serve_app.sessions.request import Request
+from rlservo.serve_app.sessions.request import TRACEPARENT, Request, trace_id
 from rlservo.serve_app.versions.loaded_versions import Decision
 
 PROTOCOL = "grpc"
@@ -77,8 +77,10 @@ class Grpc:
         try:
             request = self._begin(method, context)
             request.deadline_ms = None if remaining_s is None else remaining_s * 1e3
-            if request.request_id is not None:
-                context.set_trailing_metadata([(REQUEST_ID, request.request_id)])
+            echoed = [] if request.request_id is None else [(REQUEST_ID, request.request_id)]
+            if trace_id(request.headers) is not None:
+                echoed.append((TRACEPARENT.decode(), request.headers[TRACEPARENT].decode()))
+            context.set_trailing_metadata(echoed)
             if method == "ModelInfer":
                 return await self._handler.answer(CODEC, request, content)
             return self._look_up(method, content)
