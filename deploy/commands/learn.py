@@ -34,7 +34,7 @@ def learn(
     ] = [],  # noqa: B006
     server: Annotated[str, typer.Option(help="URL of the server.", envvar="RLSERVO_URL")] = LOCAL,
     alias: Annotated[str, typer.Option(help="Alias of the newest version.")] = "learning",
-    every: Annotated[int, typer.Option(min=1, help="Updates between two versions.")] = 5,
+    every: Annotated[int, typer.Option(min=1, help="Updates between two versions, 1 or more.")] = 5,
     batch_size: Annotated[
         int | None, typer.Option(min=1, help="Steps per update, in whole episodes; the checkpoint's by default.")
     ] = None,

@@ -12,6 +12,7 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.serve import split_pair, split_share
 from rlservo.deploy.terminal import Json, print_json
+from rlservo.errors import UnauthenticatedError
 from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
@@ -185,7 +186,13 @@ def _client(url: str, key_file: Path | None) -> Iterator[AdminClient]:
     with needs_extra("client"):
         from rlservo.client.admin_client import AdminClient, find_key
     with AdminClient(url, api_key=find_key(url, key_file)) as client:
-        yield client
+        try:
+            yield client
+        except UnauthenticatedError:
+            given = key_file or "RLSERVO_ADMIN_KEY, or in the file that 'rlservo serve' wrote here"
+            raise UnauthenticatedError(
+                f"{url} does not know the key in {given}: expected one of that server's keys"
+            ) from None
 
 
 def _repository(places: list[str]) -> OfflineCommands:

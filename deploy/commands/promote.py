@@ -51,7 +51,7 @@ def promote(
     log: Annotated[
         Path | None, typer.Option(help="File for the log in JSON lines; promote-NAME-VERSION.jsonl by default.")
     ] = None,
-    every: Annotated[float, typer.Option(min=1, max=10, help="Seconds between checks.")] = 5.0,
+    every: Annotated[float, typer.Option(min=1, max=10, help="Seconds between checks, 1 to 10.")] = 5.0,
     url: Annotated[
         list[str],
         typer.Option(

@@ -26,7 +26,9 @@ ConfigOption = Annotated[
 ]
 VersionsOption = Annotated[
     list[str] | None,
-    typer.Option("--versions", metavar="NAME=VERSION,...", help="Versions to load; by default all in the repository."),
+    typer.Option(
+        "--versions", metavar="NAME=VERSION,...", help="Versions of a policy to load; repeatable. All by default."
+    ),
 ]
 AliasOption = Annotated[
     list[str] | None,
@@ -161,8 +163,14 @@ def served_config(
     document = _load_config(file) if file is not None else {}
     policies = document.setdefault("policies", {})
 
+    for option, texts in (("--versions", versions), ("--canary", canaries), ("--shadow", shadows)):
+        names = [text.replace(":", "=").partition("=")[0] for text in texts or ()]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise UsageError(f"{option} names policy {twice[0]!r} twice: expected it once")
     for text in versions or ():
         name, numbers = split_pair(text, "ur5=3,4")
+        if "=" in numbers:
+            raise UsageError(f"--versions {text!r}: expected one policy, such as ur5=3,4; repeat the option for others")
         policies.setdefault(name, {})["versions"] = numbers.split(",")
     for text in aliases or ():
         name, pair = split_pair(text, "ur5:production=3", ":")

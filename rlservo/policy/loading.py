@@ -167,8 +167,7 @@ def _check_divisions(bundle: Bundle, file: Path) -> None:
         if not CHECKS_ZERO:
             trap, how = "be 0 or -1, which ends the process", "install onnxruntime 1.25 or newer (Python 3.11)"
         raise BundleError(
-            f"{bundle.onnx} divides integers by a number that may {trap}: {how}, or export the policy again "
-            f"({first_line(error)})"
+            f"{bundle.onnx} divides integers by a number that may {trap}: {how}, or export the policy again"
         ) from error
     finally:
         file.write_bytes(model)

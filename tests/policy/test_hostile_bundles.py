@@ -379,7 +379,8 @@ def test_an_integer_division_that_could_end_the_process_is_refused(
 ) -> None:
     folder = box_policy(tmp_path)
     with_nodes(folder, *nodes, **more)
-    with pytest.raises(BundleError, match=r"divides integers by a number that may be .*-1, which ends the process"):
+    ours = r"divides integers by a number that may be .*-1, which ends the process.*, or export the policy again$"
+    with pytest.raises(BundleError, match=ours):
         Policy.load(folder, check_golden=False)
 
 

@@ -38,10 +38,12 @@ def read_key(file: Path) -> str:
     try:
         with file.open(encoding="ascii") as stream:
             key = stream.read(LONGEST_KEY_FILE).strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"the key file {file} cannot be read: {error}") from None
-    if not key or len(key.split()) != 1:
-        raise UsageError(f"the key file {file} should hold one key and nothing else")
+    except OSError as error:
+        raise UsageError(f"the key file {file} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        key = ""
+    if len(key.split()) != 1:
+        raise UsageError(f"the key file {file} does not hold a key: expected the key alone, on one line")
     return key
 
 

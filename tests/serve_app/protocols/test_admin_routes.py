@@ -330,6 +330,19 @@ def test_the_command_line_does_all_of_it(port: int, key_path: Path) -> None:
         run(port, key_path, "alias", "ur5", "production")
 
 
+def test_the_command_line_names_the_file_of_a_wrong_key(port: int, tmp_path: Path) -> None:
+    file = tmp_path / "operator.key"
+    for text, sentence in (
+        (new_key("stranger", admin=True)[0], f"does not know the key in {file}: expected one of that server's keys"),
+        ("operator admin sha256:00", f"the key file {file} does not hold a key: expected"),
+        ("ключ", f"the key file {file} does not hold a key: expected"),
+    ):
+        file.write_text(text)
+        with pytest.raises((UnauthenticatedError, UsageError)) as caught:
+            run(port, file, "unload", "ur5")
+        assert sentence in caught.value.message
+
+
 def test_the_operators_key_is_for_this_user_alone_and_goes_with_the_server(
     port: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -371,6 +384,11 @@ def test_serve_takes_versions_from_a_file_and_options_win(tmp_path: Path) -> Non
     for wrong in ("ur5", "ur5:production", "=3"):
         with pytest.raises(UsageError, match="expected something like"):
             served_config(None, None, [wrong], None, None)
+    with pytest.raises(UsageError, match=r"^--versions 'ur5=1,ur5=2': expected one policy, such as ur5=3,4"):
+        served_config(None, ["ur5=1,ur5=2"], None, None, None)
+    for given in ((["p=1", "p=2"], None, None, None), (None, None, ["p:1=0.1", "p:2=0.1"], None)):
+        with pytest.raises(UsageError, match=r"^--(versions|canary) names policy 'p' twice: expected it once$"):
+            served_config(None, *given)
     file.write_text("a: [")
     with pytest.raises(UsageError, match="cannot be read"):
         served_config(file, None, None, None, None)
