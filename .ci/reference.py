@@ -205,7 +205,8 @@ def http_api() -> str:
     text = ["# HTTP API", NOTE]
     text.append(
         paragraph(
-            "Every route: `open` needs no key, `act` one of the server's keys if it has any, `admin` an admin key. "
+            "Every route: `open` needs no key, `act` needs one of the server's keys if it has any, "
+            "`admin` an admin key. "
             "[Protocols](protocols.md) explains the fields."
         )
     )

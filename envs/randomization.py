@@ -283,7 +283,7 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     def _element_count(self, name: str, value: object) -> int:
         space = self.observation_space
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
-            raise ValueError(f"{name} is {value!r}: the observation space is {space}, expected a Box of one dimension")
+            raise ValueError(f"{name} is {value!r}: the observation space is {space}, expected a one-dimensional Box")
         return space.shape[0]
 
     def _by_element(self, name: str, value: ByElement) -> Vector | None:

@@ -188,7 +188,7 @@ def open_conventions(elements: ElementNames) -> str:
         )
         if names
     ]
-    return f"no file says {', nor '.join(asked)}: a real robot takes no policy that leaves this open" if asked else ""
+    return f"no file says {', nor '.join(asked)}: a real robot accepts no policy that leaves this open" if asked else ""
 
 
 def _flat(elements: Elements) -> list[Element]:
@@ -204,7 +204,7 @@ def _each(elements: Elements, change: Callable[[tuple[Element, ...]], tuple[Elem
         changed = change(elements)
     if changed == elements:
         raise UsageError(
-            f"--convention {name}: no element is known to need it: its quantity is not known, or the source says it"
+            f"--convention {name}: no element needs it: their quantities are unknown, or the source states it"
         )
     return changed
 

@@ -79,8 +79,8 @@ def _initial(name: str, values: ArrayLike) -> NDArray[Any]:
     given = np.asarray(values)
     if isinstance(values, np.ndarray | np.generic) and given.dtype != np.float32:
         raise UsageError(
-            f"the state '{name}' is {given.dtype}: a bundle carries states as float32, so give it and let the module "
-            "return it as float32"
+            f"the state '{name}' is {given.dtype}: a bundle carries states as float32, so pass it, and return it from "
+            "the module, as float32"
         )
     return given.astype(np.float32)
 

@@ -169,7 +169,7 @@ def _check_spaces(contract: Contract, recipe: Recipe) -> None:
         theirs = {name: tuple(leaf.shape) for name, leaf in leaves.items()}
         if ours != theirs:
             raise UsageError(
-                f"policy '{contract.name}' has {which}s of shape {_shapes(ours)}, the checkpoint's have "
+                f"policy '{contract.name}' has {which}s of shape {_shapes(ours)}, but the checkpoint's have "
                 f"{_shapes(theirs)}: they do not belong together"
             )
 

@@ -80,7 +80,7 @@ def export(
         list[str] | None,
         typer.Option(
             metavar="OUTPUT=USE",
-            help="ONNX: use of an output that its name does not tell: `action`, `none`, or the input that gets it at "
+            help="ONNX: use of an output whose name does not show it: `action`, `none`, or the input that gets it at "
             "the next step (a recurrent state).",
         ),
     ] = None,
@@ -94,7 +94,8 @@ def export(
         list[str] | None,
         typer.Option(
             metavar="NAME=VALUE",
-            help="What no file says: quaternion=wxyz or xyzw, frame=NAME (of poses and velocities), action=absolute, "
+            help="Conventions that no file states: quaternion=wxyz or xyzw, frame=NAME (of poses and "
+            "velocities), action=absolute, "
             "relative, velocity or effort.",
         ),
     ] = None,

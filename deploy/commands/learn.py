@@ -27,7 +27,7 @@ def learn(
     ],
     out: Annotated[Path, typer.Option(help="The run's folder; the same command resumes the run.")],
     recordings: Annotated[
-        list[Path], typer.Option(help="Folder in which a server records; repeat it for each server.")
+        list[Path], typer.Option(help="Folder in which a server records; repeat the option for each server.")
     ] = [],  # noqa: B006 - typer copies it
     follow: Annotated[
         list[str], typer.Option(metavar="URL", help="Remote server that records; its files are copied to OUT.")
@@ -52,7 +52,7 @@ def learn(
     ] = None,
     reward_from: Annotated[
         list[str],
-        typer.Option(metavar="MODULE", help="Module whose functions the contract may name as reward; repeat it."),
+        typer.Option(metavar="MODULE", help="Module whose functions the contract may name as reward; repeatable."),
     ] = [],  # noqa: B006
     versions: Annotated[
         int | None, typer.Option(min=1, help="Stop after this many new versions; by default at Ctrl-C.")
@@ -123,7 +123,7 @@ def learn(
             share = parse_number("--canary", canary, {**PERCENT, "": 1.0}, 1.0)
             seconds = parse_number("--promote", promote, SECONDS, LONGEST_S)
             if not share or not seconds:
-                raise UsageError("--promote and --canary: expected more than 0")
+                raise UsageError(f"--promote {promote}, --canary {canary}: expected both above 0")
             watched = Terms((server,), policy, "", share, seconds, PromotionLimits(error_rate=rate, success_drop=drop))
         copies = [
             ServerRecordings(partial(connect, url), run.path / "followed" / re.sub(r"[^A-Za-z0-9.]+", "_", url))

@@ -34,7 +34,7 @@ class Format(str, Enum):
 
 @log.command()
 def info(files: Files, as_json: Json = False) -> None:
-    """Show the content of recordings and missing records. ROS 2 bags (.mcap) may be among them.
+    """Show what recordings contain and which records are missing. A folder may also hold ROS 2 bags (.mcap).
 
     Example: `rlservo log info recordings`
     """

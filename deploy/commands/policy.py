@@ -29,13 +29,15 @@ policy = typer.Typer(
 Url = Annotated[str, typer.Option(help="URL of the server.", envvar="RLSERVO_URL")]
 KeyFile = Annotated[
     Path | None,
-    typer.Option(help="File with the admin key; else RLSERVO_ADMIN_KEY, else the one 'rlservo serve' wrote here."),
+    typer.Option(
+        help="File with the admin key; by default RLSERVO_ADMIN_KEY, then the key that 'rlservo serve' wrote here."
+    ),
 ]
 Repository = Annotated[
     list[str] | None,
     typer.Option(
         metavar="DIR|URI",
-        help="Repository to change instead of a server; repeat it as for 'rlservo serve'. Its servers follow.",
+        help="Repository to change instead of a server; its servers follow. Repeatable, as for 'rlservo serve'.",
     ),
 ]
 Name = Annotated[str, typer.Argument(help="Policy name.")]
@@ -46,9 +48,9 @@ LOCAL = "http://127.0.0.1:8000"
 def list_policies(
     url: Url = LOCAL, key_file: KeyFile = None, repository: Repository = None, as_json: Json = False
 ) -> None:
-    """Show the served versions, and since when. With --repository also the versions that are not loaded.
+    """List the served versions. With --repository, also list the versions that are not loaded.
 
-    Behind a proxy or on Ray Serve the table is the answering replica's alone: ask again for others, or read
+    Behind a proxy or on Ray Serve the table shows only the replica that answers: repeat the command for others, or read
     `rlservo_plan_generation` in each one's metrics.
 
     Example: `rlservo policy list`
@@ -88,7 +90,7 @@ def load(
 ) -> None:
     """Load and prove a version, without using it.
 
-    Clients keep the version that they get. If the policy is not served yet, the version loaded first is in use at once.
+    Clients keep the version that they get. If the policy is not served yet, the first version loaded is in use at once.
 
     Example: `rlservo policy load ur5 4`
     """
@@ -174,7 +176,7 @@ def shadow(
     repository: Repository = None,
     as_json: Json = False,
 ) -> None:
-    """Compute and compare another version's actions. `off` ends the shadow. Metrics have the differences.
+    """Compute and compare another version's actions. `off` ends the shadow. The metrics show the differences.
 
     Example: `rlservo policy shadow ur5 candidate`
     """

@@ -31,21 +31,22 @@ def promote(
     ] = "10m",
     max_error_rate: Annotated[
         str | None,
-        typer.Option(metavar="SHARE", help="Share of its requests that may fail through its own fault: 0.1%."),
+        typer.Option(metavar="SHARE", help="Share of the version's requests that may fail through its fault: 0.1%."),
     ] = None,
     max_p99: Annotated[
-        str | None, typer.Option(metavar="TIME", help="Latency in the server that 1% of its answers may exceed: 20ms.")
+        str | None, typer.Option(metavar="TIME", help="Latency in the server that 1% of the answers may exceed: 20ms.")
     ] = None,
     max_action_difference: Annotated[
         float | None,
-        typer.Option(min=0, help="Difference from production, in action units, that 1% of its actions may exceed."),
+        typer.Option(min=0, help="Difference from production, in action units, that 1% of the actions may exceed."),
     ] = None,
     max_success_drop: Annotated[
         str | None,
-        typer.Option(metavar="SHARE", help="Allowed drop in the share of successful episodes below production's: 2%."),
+        typer.Option(metavar="SHARE", help="Allowed drop in the share of successful episodes from production's: 2%."),
     ] = None,
     min_requests: Annotated[
-        int, typer.Option(min=1, help="Requests (or compared actions) required for a decision; at least 1 / limit are.")
+        int,
+        typer.Option(min=1, help="Requests (or compared actions) required for a decision; never fewer than 1 / limit."),
     ] = 100,
     min_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each version required for a decision.")] = 20,
     log: Annotated[
@@ -67,7 +68,7 @@ def promote(
     exceeded with 99.7% confidence, if metrics fall or contradict themselves, or if they cannot be read for a minute;
     and at the end if a limit is exceeded or there were too few cases. Exit code: 0 promoted, 1 rolled back, 4 stopped
     because another command changed what is served or the server is unreachable, 2 bad input. Ctrl-C rolls back (130).
-    Killed, it leaves the canary running; the same command continues with the remaining time.
+    If the command is killed, the canary keeps running; the same command continues with the remaining time.
 
     Example: `rlservo policy promote ur5 2 --canary 10% --for 10m --max-error-rate 0.1% --max-p99 20ms`
     """
@@ -97,7 +98,7 @@ def promote(
     share = parse_number("--canary", canary, {**PERCENT, "": 1.0}, 1.0)
     watched_s = parse_number("--for", seconds, SECONDS, LONGEST_S)
     if not share or not watched_s:
-        raise UsageError("--canary and --for: expected more than 0")
+        raise UsageError(f"--canary {canary}, --for {seconds}: expected both above 0")
     terms = Terms(tuple(url), name, version, share, watched_s, limits)
     file = log or Path(f"promote-{name}-{version}.jsonl")
 

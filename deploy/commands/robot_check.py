@@ -19,7 +19,7 @@ def robot_check(
     robot: Annotated[
         str, typer.Argument(metavar="ADDRESS", help="rtde://HOST, ros2:... (an arm) or rosbridge://HOST:PORT (a base).")
     ],
-    ur_model: Annotated[str | None, typer.Option(help="Model that it should be, such as ur5e.")] = None,
+    ur_model: Annotated[str | None, typer.Option(help="Expected robot model, such as ur5e.")] = None,
     bundle: Annotated[Path | None, typer.Option(help="Also check whether this bundle may drive it.")] = None,
     limit: Limit = None,
     as_json: Json = False,
@@ -65,7 +65,7 @@ def _bundle_problem(folder: Path, robot: str, model: str) -> str:
 
     contract = load_bundle(bundle_of(folder, None)).contract
     if contract.provenance.env_id is None:
-        return "it names no environment of ours that it was trained in: it cannot be compared with this robot"
+        return "it does not name a training environment of rlservo, so it cannot be compared with this robot"
     trained_in, arguments = wrapped_env(contract.provenance.env_id, contract.provenance.env_config)
     env_id = plain_id(trained_in)
     arguments |= {"ur_model": model} if model else {}

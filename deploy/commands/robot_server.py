@@ -54,7 +54,7 @@ def robot_server_ur(
         str, typer.Option(help="Content of a state: only_robot, 1object, 1moving2points or 2objects2points.")
     ] = "only_robot",
     action_mode: Annotated[
-        str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from the present ones.")
+        str, typer.Option(help="abs_pos: actions are joint positions; delta_pos: offsets from the current ones.")
     ] = "abs_pos",
     action_cycle_rate: Annotated[float, typer.Option(help="Control cycles per second [Hz].")] = 25.0,
     max_velocity_scale_factor: Annotated[
@@ -73,7 +73,7 @@ def robot_server_ur(
     ] = "mujoco",
     limit: Limit = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Real arm: move to SetState's poses without confirmation here.")
+        bool, typer.Option("--yes", help="Real arm: move to SetState's poses without confirmation at this terminal.")
     ] = False,
     metrics: Annotated[
         str | None,
@@ -219,7 +219,9 @@ def robot_latency(
     ur_model: Annotated[str, typer.Option(help=f"Model: {MODELS}.")] = "ur5e",
     control_rate: Annotated[float, typer.Option(min=0.1, help="The policy's rate [Hz].")] = 10.0,
     steps: Annotated[int, typer.Option(min=5, help="Motions to measure.")] = 20,
-    hours: Annotated[float, typer.Option(min=0.0, help="Go on for at least so many hours: rare delays need it.")] = 0.0,
+    hours: Annotated[
+        float, typer.Option(min=0.0, help="Measure for at least this many hours, to find rare delays.")
+    ] = 0.0,
     limit: Limit = None,
     yes: Annotated[bool, typer.Option("--yes", help="Move without confirmation.")] = False,
     as_json: Json = False,
@@ -278,7 +280,7 @@ def robot_latency(
 
 
 def ur_controller(
-    model: Annotated[str, typer.Option(help=f"{MODELS}; of 500 Hz, but ur3, ur5 and ur10 of 125 Hz.")] = "ur5e",
+    model: Annotated[str, typer.Option(help=f"{MODELS}; 500 Hz, except ur3, ur5 and ur10 (125 Hz).")] = "ur5e",
     host: Annotated[
         str, typer.Option(help="Address to listen on; the ports are always 29999 and 30001 to 30004.")
     ] = "127.0.0.1",
@@ -298,8 +300,8 @@ def ur_controller(
 
         def ready() -> None:
             terminal.output().print(
-                f"{model} controller on {host}, ports 29999 and 30001 to 30004; help and Enter lists commands, "
-                "Ctrl-C ends it",
+                f"{model} controller on {host}, ports 29999 and 30001 to 30004; help lists its commands, "
+                "Ctrl-C stops it",
                 highlight=False,
                 soft_wrap=True,
             )

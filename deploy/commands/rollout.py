@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 TransportKind = Literal["http", "ws"]
 VersionOrAlias = Annotated[
     str | None,
-    typer.Option(help="Version or alias, with --bundle a version or 'newest'; by default the one in production."),
+    typer.Option(help="Version or alias (with --bundle: a version or 'newest'); production by default."),
 ]
 
 
@@ -71,14 +71,14 @@ def rollout(
         str | None,
         typer.Option(
             metavar="KIND=SIZE,...",
-            help="Disturbances to drive under, such as latency=3,noise=real,payload=3; see `rlservo verify -h`.",
+            help="Disturbances to apply, such as latency=3,noise=real,payload=3; see `rlservo verify -h`.",
         ),
     ] = None,
     app_dir: Annotated[
         Path, typer.Option(help="Folder of the Python module that registers your environment.")
     ] = Path(),
     yes: Annotated[
-        bool, typer.Option("--yes", help="Real robot: move without confirmation; after a stop it asks nevertheless.")
+        bool, typer.Option("--yes", help="Real robot: move without confirmation; after a stop it still asks.")
     ] = False,
     dry_run: Annotated[
         bool,
@@ -101,7 +101,7 @@ def rollout(
     arguments = parse_env_arguments(env_arg or [], target) | ({"confirm": False} if yes else {})
     if dry_run:
         if "robot" not in arguments:
-            raise UsageError("--dry-run needs a real arm (--env-arg robot=...): anything else moves nothing anyway")
+            raise UsageError("--dry-run needs a real arm: add --env-arg robot=ADDRESS")
         arguments, episodes, unproven, rate = arguments | {"dry_run": True}, 1, True, "max"
     if "robot" in arguments:
         require_robot(str(arguments["robot"]))

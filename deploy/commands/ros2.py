@@ -43,7 +43,7 @@ def ros2(
     max_age: Annotated[
         float | None, typer.Option(min=0.01, help="Mapped elements: age [s] beyond which an input is not used.")
     ] = None,
-    autostart: Annotated[bool, typer.Option("--autostart", help="Start without a call of the start service.")] = False,
+    autostart: Annotated[bool, typer.Option("--autostart", help="Start without a call to the start service.")] = False,
     transport: Annotated[TransportKind, typer.Option(help="With --url: http or ws.")] = "http",
     deadline_ms: Annotated[float | None, typer.Option(help="With --url: deadline for each action.")] = None,
     fallback: Annotated[

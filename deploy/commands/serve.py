@@ -45,7 +45,7 @@ CanaryOption = Annotated[
 ShadowOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--shadow", metavar="NAME=VERSION", help="Version that runs in parallel, only for comparison of its actions."
+        "--shadow", metavar="NAME=VERSION", help="Version whose actions are computed and compared, but not sent."
     ),
 ]
 
@@ -58,7 +58,7 @@ def serve(
         list[str],
         typer.Argument(
             metavar="DIR|URI...",
-            help="Bundles, policy folders or repositories, also s3://... as written by `rlservo publish`.",
+            help="Bundles, policy folders or repositories, including s3://... written by `rlservo publish`.",
         ),
     ],
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",

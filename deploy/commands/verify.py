@@ -66,7 +66,7 @@ def verify(
     compiled: Annotated[
         Path | None,
         typer.Option(
-            help="Folder from `rlservo compile`: also drive --env with it; equal seeds must end the same way."
+            help="Folder from `rlservo compile`: also drive --env with it; the same seed must end the same way."
         ),
     ] = None,
     write: Annotated[
@@ -207,7 +207,8 @@ def _verify_compiled(
     if not as_json:
         endings = ", ".join(f"{name}: {count}" for name, count in reports[0].final_status.items())
         terminal.output().print(
-            f"compiled  {episodes} episodes of {env_id} end alike ({endings}); returns differ by at most {apart:.2g}",
+            f"compiled  {episodes} episodes of {env_id} end the same way ({endings}); returns differ by "
+            f"at most {apart:.2g}",
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     return {"compiled": {"episodes": episodes, "endings": reports[0].final_status, "max_return_difference": apart}}

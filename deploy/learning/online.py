@@ -108,9 +108,9 @@ class OnlineLearning:
         if reason is None:
             return True
         if len(versions) == 1:
-            raise UsageError(f"robots do not get version {newest}, the checkpoint itself: {reason}")
+            raise UsageError(f"the server does not serve version {newest}, the checkpoint itself: {reason}")
         versions.pop()
-        self._refuse(f"robots do not get version {newest}: {reason}")
+        self._refuse(f"the server does not serve version {newest}: {reason}")
         self._release.unload(newest)
         return False
 

@@ -113,7 +113,7 @@ class RunFolder(Closeable):
         ours = {LOCK_FILE, REWARD_FILE, STATE_FILE, f"{STATE_FILE}.part", *FOLDERS}
         others = sorted({entry.name for entry in self.path.iterdir()} - ours)
         if others:
-            raise UsageError(f"--out {self.path} holds {others[0]}: expected a new folder, or that of a run")
+            raise UsageError(f"--out {self.path} holds {others[0]}: expected a new folder, or the folder of a run")
 
     def _read(self, terms: dict[str, Any], reward_source: str | None) -> RunState:
         file, shown = self.path / STATE_FILE, self.path / REWARD_FILE

@@ -169,7 +169,9 @@ def places(contract: Contract, mapped: Mapping[str, str]) -> tuple[list[Place], 
     acted = [_with_stop(place, mapped.get(f"stop.{place.element}")) for place in acted]
     for place in (*observed, *acted):
         if (kind := kinds.setdefault(place.topic, place.kind)) != place.kind:
-            raise UsageError(f"{place.topic} is mapped as {kind}, and for {place.element!r} as {place.kind}")
+            raise UsageError(
+                f"{place.topic} is mapped as both {kind} and {place.kind} (for {place.element!r}): expected one type"
+            )
     commanded: dict[tuple[str, str], str] = {}
     for place in acted:
         if (other := commanded.setdefault((place.topic, place.field), place.element)) != place.element:
@@ -197,7 +199,7 @@ def check_conventions(
             if found := contradiction([element], [carried]):
                 what = found[0].partition(") ")[2] or "is the quaternion's part"
                 raise UsageError(
-                    f"policy {contract.name!r}: {side} element {element.name!r} {what} {found[1]}, and "
+                    f"policy {contract.name!r}: {side} element {element.name!r} {what} {found[1]}, but "
                     f"{place.topic} {place.field} {what} {found[2]}"
                 )
 

@@ -188,7 +188,7 @@ def _drive_elements(
             try:
                 action = np.asarray(policy.act(observation))
                 if (took_s := time.monotonic() - began) > inputs.max_age_s:
-                    raise DeadlineError(f"the action came {took_s:.2f} s late, more than {inputs.max_age_s:g} s")
+                    raise DeadlineError(f"the action took {took_s:.2f} s: expected at most {inputs.max_age_s:g} s")
                 outputs.act(present.targets(action, observation))
                 is_acting = True
                 node.enter("running")

@@ -74,7 +74,9 @@ class _RealBase(Mir100Navigation):
             raise InvalidResetError(f"reset option 'target_pose': {why}")
         self.simulation.place(start, target=target)
         if (status := self._failure()) is not None:
-            raise InvalidResetError(f"the base stands where an episode ends at once ({status}): drive it away by hand")
+            raise InvalidResetError(
+                f"the base stands where an episode would end at once ({status}): drive it away by hand"
+            )
 
 
 class NoObstacleNavigationMir100Rob(_RealBase, NoObstacleNavigationMir100Sim):

@@ -79,7 +79,7 @@ class ServerProcess:
             selector.register(pipe, selectors.EVENT_READ)
             while b"\n" not in output:
                 if not selector.select(max(0.0, deadline - time.monotonic())):
-                    raise StartFailedError(f"the robot server did not come up within {START_TIMEOUT_S:g} s")
+                    raise StartFailedError(f"the robot server did not start within {START_TIMEOUT_S:g} s")
                 part = os.read(pipe, 4096)
                 if not part:
                     raise StartFailedError(f"the robot server exited while starting (exit code {self._process.wait()})")

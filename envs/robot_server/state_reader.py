@@ -68,7 +68,8 @@ def env_of(state: RobotState) -> str:
         has_cubes = any(state.values[CUBES])
         return f"rlservo/{'ObstacleAvoidance' if has_cubes else 'NoObstacleNavigation'}Mir100Sim-v0"
     raise RobotServerError(
-        f"the state has {len(state.values)} numbers: expected a UR arm's or a Panda's by name, or a MiR100's 1030"
+        f"the state has {len(state.values)} numbers: expected the named state of a UR arm or a Panda, or "
+        f"the {STATE_LENGTH} numbers of a MiR100"
     )
 
 

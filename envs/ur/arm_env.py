@@ -87,7 +87,7 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         render_mode: str | None,
     ) -> None:
         if all(fixed):
-            raise ValueError(f"all {len(fixed)} joints are fixed: no joint is left to act on")
+            raise ValueError(f"all {len(fixed)} joints are fixed: no joint is left to move")
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self.simulation = make_simulation()

@@ -175,7 +175,7 @@ def explain(error: BaseException) -> str:
     if isinstance(error, pickle.UnpicklingError) and "weights_only" in str(error):  # torch advises to load it unsafely
         code = re.search(r"GLOBAL (\S+)", str(error))
         what = f"names the code '{code[1]}'" if code else "is damaged, or no file of torch.save"
-        return f"its weights are not tensors alone: the file {what}, and is not loaded"
+        return f"its weights are not tensors alone: the file {what}, and cannot be loaded"
     if isinstance(error, EOFError | pickle.UnpicklingError):
         return TRUNCATED.format(first_line(error))
     return first_line(error)

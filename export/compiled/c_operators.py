@@ -249,12 +249,12 @@ def _along(program: Program, node: Node) -> None:
         axes = list(range(axes[0], value.ndim))
         scale = " + ".join(f"{program.ref(name)}[k]" for name in others)
     if not axes or axes != list(range(axes[0], axes[-1] + 1)) or not all(map(program.is_constant, others)):
-        raise refused(node.op, "its axes are no neighbours, or computed")
+        raise refused(node.op, "its axes are not adjacent, or are computed")
     if (value.dtype.kind != "f" and node.op not in OF_INTEGERS) or (node.opset < 13 and "Softmax" in node.op):
         raise refused(node.op, f"of {value.dtype.name} values in opset {node.opset}")
     outer, n, inner = _around(value.shape, axes)
     if scale and (any(node.outputs[1:]) or any(program.value(name).size != n for name in others)):
-        raise refused(node.op, "its scale is not of its input's size, or its mean is an output")
+        raise refused(node.op, "its scale does not have its input's size, or its mean is an output")
     source, result = program.ref(data), program.new(node.outputs[0])
     epsilon = number(value.dtype.type(given.get("epsilon", 0)))
     text = ALONG[node.op].format(f="f" if value.dtype == np.float32 else "", scale=scale, epsilon=epsilon)

@@ -205,7 +205,7 @@ def _check(
         row = int(np.flatnonzero(here != there)[0])
         raise ParityError(
             f"observation {first + row}: the compiled policy {'refuses' if here[row] else 'gives'} an action "
-            f"that onnxruntime {'gives' if here[row] else 'may not give'}"
+            f"that onnxruntime {'gives' if here[row] else 'must not give'}"
         )
     name = max(shares, key=lambda each: float(shares[each].max(initial=0.0)))
     if not shares[name].max(initial=0.0) <= 1.0:

@@ -456,7 +456,7 @@ def check_filter() -> None:
             if not hasattr(env_to_module.MeanStdFilter(), name):
                 raise AttributeError(name)
     except (AttributeError, TypeError, ValueError):
-        raise UsageError(f"Ray {ray.__version__} filters observations in another way: use its own connectors") from None
+        raise UsageError(f"Ray {ray.__version__} filters observations differently: use its own connectors") from None
 
 
 def _filtered(row: Any, running: Any) -> Any:

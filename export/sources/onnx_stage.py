@@ -239,7 +239,7 @@ class OnnxStage(nn.Module):
             self._keep(outputs[0], np.array(sizes[attributes.get("start", 0) : attributes.get("end")]))
         elif kind not in PLAIN and kind not in OPERATORS:
             raise UnsupportedError(
-                f"{file.name} has the operation {kind}, of which no torch form is known here: export the model "
+                f"{file.name} has the operation {kind}, which rlservo cannot convert to torch: export the model "
                 "without it (LEAPP: with export_with='jit-trace')"
             )
         else:

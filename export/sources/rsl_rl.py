@@ -194,7 +194,7 @@ def _acting_part(
             f"'actor' in {agent_file}), got {', '.join(sorted(map(str, weights))[:4])}"
         )
     if not isinstance(state_dict, dict) or not all(isinstance(each, torch.Tensor) for each in state_dict.values()):
-        raise CheckpointError(f"{file}: its '{ACTORS[part]}' is no dictionary of tensors")
+        raise CheckpointError(f"{file}: its '{ACTORS[part]}' is not a dictionary of tensors")
     return part, state_dict
 
 

@@ -148,7 +148,7 @@ def find_statistics(model: Path, data: Mapping[str, Any], given: Path | None, no
         if given is None and has_acted and not shows_vecnormalize(data):
             raise CheckpointError(
                 f"{model}: the model was trained without VecNormalize, and {statistics.name} lies beside it: give "
-                f"--vecnormalize none, or --vecnormalize {statistics} if it is this model's all the same"
+                f"--vecnormalize none, or --vecnormalize {statistics} if it does belong to this model"
             )
         notify(f"VecNormalize is the one of {statistics}")
         return statistics

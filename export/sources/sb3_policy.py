@@ -82,7 +82,7 @@ def restore_policy(
         mask = MultiBinary(_choices(policy.action_space))
         if isinstance(layout.frame, Dict):
             if ACTION_MASK in layout.frame.spaces:
-                raise UnsupportedError(f"{file}: the observation has a part '{ACTION_MASK}' already: rename it")
+                raise UnsupportedError(f"{file}: the observation already has a part '{ACTION_MASK}': rename it")
             observation_space = Dict([*layout.frame.spaces.items(), (ACTION_MASK, mask)])
         else:
             observation_space = Dict({OBSERVATIONS: layout.frame, ACTION_MASK: mask})
@@ -158,8 +158,8 @@ def _check_order(file: Path, layout: Layout, wrappers: Wrappers) -> None:
     accepted = tuple(name for name in wrappers.names if name in steps or name != "VecNormalize")
     if steps != accepted:
         raise CheckpointError(
-            f"{file}: by the shapes of model and statistics an observation passes {', '.join(steps) or 'no wrapper'}, "
-            f"by Stable-Baselines3's own checks {', '.join(accepted) or 'none'}: give the --vecnormalize and "
+            f"{file}: by the shapes of model and statistics, its wrappers are {', '.join(steps) or 'none'}, but by "
+            f"Stable-Baselines3's own checks {', '.join(accepted) or 'none'}: give the --vecnormalize and "
             "--frame-stack of its training"
         )
 
@@ -322,7 +322,8 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     models = _leaves(model_space)
     statistics = _leaves(vec.observation_space) if vec is not None else {}
     if statistics and dict.fromkeys(statistics) != dict.fromkeys(models):
-        raise CheckpointError(f"{file}: VecNormalize's statistics cover the parts {', '.join(statistics)}, the model "
+        raise CheckpointError(f"{file}: VecNormalize's statistics cover the parts "
+        f"{', '.join(statistics)}, but the model "
                               f"takes {', '.join(models)}: they do not belong together")  # fmt: skip
     stacked: dict[str, tuple[Any, int]] = {}
     frame_spaces: dict[str, Any] = {}
@@ -338,7 +339,7 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
         if seen is not None and seen.shape != whole.shape:
             if not _fits(seen.shape, whole.shape, axis) or frames not in (1, whole.shape[axis] // seen.shape[axis]):
                 raise CheckpointError(
-                    f"{file}: VecNormalize's statistics are for observations {seen.shape}, the model's are "
+                    f"{file}: VecNormalize's statistics are for observations {seen.shape}, but the model's are "
                     f"{model.shape}: they do not belong together"
                 )
             frames = whole.shape[axis] // seen.shape[axis]

@@ -155,7 +155,8 @@ def _affine(spec: ModuleSpec) -> Affine | None:
             sides.append(np.ascontiguousarray(np.broadcast_to(values, spec.action_space.shape)))
         except ValueError:
             raise UsageError(
-                f"{name} has shape {values.shape}, the action {spec.action_space.shape}: expected one number, or one "
+                f"{name} has shape {values.shape}, but the action has {spec.action_space.shape}: expected "
+                "one number, or one "
                 "for each element"
             ) from None
         if not np.isfinite(values).all():
@@ -206,4 +207,4 @@ def _check_spaces(spec: ModuleSpec) -> None:
     ):
         size = int(np.prod(space.shape)) if space.shape is not None else 0
         if elements and len(elements) != size:
-            raise UsageError(f"{len(elements)} {name} names were given, the space has {size} elements")
+            raise UsageError(f"{len(elements)} {name} names were given, but the space has {size} elements")

@@ -190,7 +190,7 @@ def resolve_bundle(path: str | Path, version: str | None = None) -> Path:
         there = f"expected {NEWEST} or one of {', '.join(by_version)}"
         if plan is not None:
             raise BundleError(
-                f"{plan} has version {version} of '{policies[0].name}' in production, which is not there: {there}"
+                f"{plan} has version {version} of '{policies[0].name}' in production, which does not exist: {there}"
             )
         raise BundleError(f"{path} has no version {version}: {there}")
     return by_version[version]

@@ -86,7 +86,9 @@ class Provenance(FrozenModel):
     framework: str = Field("", description="Framework that restored the checkpoint, with its version")
     api_stack: Literal["new", "old"] | None = Field(None, description="RLlib's API stack")
     module_id: str
-    agents: tuple[str, ...] = Field(default=(), description="Agents that it acts for in a multi-agent environment")
+    agents: tuple[str, ...] = Field(
+        default=(), description="Agents that the policy acts for in a multi-agent environment"
+    )
     module_class: str
     checkpoint_sha256: str = Field(description="Hash over the checkpoint files that were read")
     options: dict[str, Any] = Field(
@@ -132,10 +134,10 @@ class Evaluation(FrozenModel):
     first_seed: int
     return_bundle: float
     return_checkpoint: float | None = None
-    return_interval: tuple[float, float] | None = Field(default=None, description="95% interval of the mean, normal")
+    return_interval: tuple[float, float] | None = Field(default=None, description="95% interval of the mean (normal)")
     success_rate_bundle: float | None
     success_rate_checkpoint: float | None = None
-    success_interval: tuple[float, float] | None = Field(default=None, description="95% interval, Wilson")
+    success_interval: tuple[float, float] | None = Field(default=None, description="95% interval (Wilson)")
     disturbance: str | None = Field(
         default=None, description="Argument of `rlservo verify --disturb`; 'none' in the first row"
     )

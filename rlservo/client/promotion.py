@@ -153,14 +153,14 @@ class Promotion:
         if version not in (versions := policy.get("versions", ())):
             raise UsageError(
                 f"policy '{name}' has no version {version}: expected one of {', '.join(versions) or 'none'}; "
-                f"'rlservo policy load {name} {version}' loads one of the server's folder"
+                f"'rlservo policy load {name} {version}' loads one from the server's repository"
             )
         if policy["version"] == version:
-            raise UsageError(f"version {version} of policy '{name}' is in production already")
+            raise UsageError(f"version {version} of policy '{name}' is already in production")
         for use in self._uses:
             if policy.get(use) is not None:
                 raise UsageError(
-                    f"policy '{name}' has a {use} already, {_shown(policy[use])}: 'rlservo policy {use} {name} off' "
+                    f"policy '{name}' already has a {use}, {_shown(policy[use])}: 'rlservo policy {use} {name} off' "
                     f"ends it ({self._last_change})"
                 )
         self._state.production = policy["version"]
@@ -323,7 +323,7 @@ class Promotion:
         if missing := sorted(known - found.keys()):
             raise UntrustedError(
                 f"'{missing[0]}' has vanished while version {self.terms.version} was on trial, so it may have died: "
-                "promote while none is removed or replaced"
+                "promote while no process is removed or replaced"
             )
         return found
 

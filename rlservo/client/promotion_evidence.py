@@ -61,7 +61,7 @@ def read_metrics(text: str, policy: str) -> dict[str, Numbers]:
             if name in READ and (name in (PLAN, UPTIME, START, LOST) or labels["policy"] == policy):
                 line = (name, *sorted(labels.items()))
                 if not 0 <= value < math.inf or not float(labels.get("le", 0)) >= 0 or "" in labels or line in lines:
-                    raise UntrustedError(f"{name} {labels} is {value}, or there twice")
+                    raise UntrustedError(f"{name} {labels} is {value}, or appears twice")
                 lines.add(line)
                 numbers = processes.setdefault(labels.get("replica", ""), {})
                 path = "/".join((name, *(labels[label] for label in READ[name])))

@@ -295,7 +295,7 @@ class RemotePolicy(ActingPolicy):
             raise UnavailableError(f"{refusal}, expected {contract.version!r}: the action was dropped")
         known = self._contracts.get(version) or self._fetch_new_version(version, deadline)
         if (known.name, known.version) != (contract.name, version):
-            raise UnavailableError(f"{refusal} but has no contract for it: the action was dropped")
+            raise UnavailableError(f"{refusal}, but has no contract for that version: the action was dropped")
         self._meet(known)
         return known
 

@@ -93,7 +93,7 @@ def check_successor(contract: Contract, known: Contract) -> None:
     """Refuse a version that a client of the known one cannot use."""
     if different := interface_differences(contract, known):
         raise UnavailableError(
-            f"version {contract.version} of policy '{contract.name}' answers now, and differs from version "
+            f"version {contract.version} of policy '{contract.name}' now answers, and differs from version "
             f"{known.version}, which this client knows: {different}; the action was dropped: make a new client, or one "
             "with version=",
             {"version": contract.version, "known": known.version, "differing": different},

@@ -82,17 +82,17 @@ def _difference(expected: SpaceSpec, actual: gym.Space[Any], *, bounds: bool) ->
         return _nested_difference(expected, actual, bounds=bounds)
     if isinstance(expected, MultiDiscreteSpec):
         if not isinstance(actual, spaces.MultiDiscrete):
-            return f"is a {type(actual).__name__} there, the policy has MultiDiscrete({list(expected.nvec)})"
+            return f"is a {type(actual).__name__} there, but the policy has MultiDiscrete({list(expected.nvec)})"
         if (actual.shape, tuple(actual.nvec.ravel().tolist())) != (expected.shape, expected.nvec):
-            return f"has {actual.nvec.tolist()} choices there, the policy has {list(expected.nvec)}"
+            return f"has {actual.nvec.tolist()} choices there, but the policy has {list(expected.nvec)}"
         return None
     if isinstance(expected, MultiBinarySpec):
         if not isinstance(actual, spaces.MultiBinary) or actual.shape != expected.shape:
-            return f"is {actual} there, the policy has MultiBinary of shape {expected.shape}"
+            return f"is {actual} there, but the policy has MultiBinary of shape {expected.shape}"
         return None
     if not isinstance(expected, BoxSpec):
         if not isinstance(actual, spaces.Discrete):
-            return f"is a {type(actual).__name__} there, the policy has Discrete({expected.n})"
+            return f"is a {type(actual).__name__} there, but the policy has Discrete({expected.n})"
         if (int(actual.n), int(actual.start)) != (expected.n, expected.start):
             return (
                 f"is {int(actual.n)} choices from {int(actual.start)} there, "
@@ -100,11 +100,11 @@ def _difference(expected: SpaceSpec, actual: gym.Space[Any], *, bounds: bool) ->
             )
         return None
     if not isinstance(actual, spaces.Box):
-        return f"is a {type(actual).__name__} there, the policy has a Box of shape {expected.shape}"
+        return f"is a {type(actual).__name__} there, but the policy has a Box of shape {expected.shape}"
     if actual.shape != expected.shape:
-        return f"has shape {actual.shape} there, the policy has {expected.shape}"
+        return f"has shape {actual.shape} there, but the policy has {expected.shape}"
     if np.dtype(actual.dtype).kind != np.dtype(expected.dtype).kind:  # float32 and float64 convert safely
-        return f"has dtype {actual.dtype} there, the policy has {expected.dtype}"
+        return f"has dtype {actual.dtype} there, but the policy has {expected.dtype}"
     if not bounds:
         return None
     for word, ours, theirs in zip(("low", "high"), expected.bounds(), (actual.low, actual.high), strict=True):
@@ -113,7 +113,7 @@ def _difference(expected: SpaceSpec, actual: gym.Space[Any], *, bounds: bool) ->
             first = tuple(int(i) for i in np.argwhere(differs)[0])
             index = int(np.ravel_multi_index(first, ours.shape)) if first else 0
             element = f" ({expected.elements[index].name})" if index < len(expected.elements) else ""
-            return f"element {index}{element} has {word} {theirs[first]:g} there, the policy has {ours[first]:g}"
+            return f"element {index}{element} has {word} {theirs[first]:g} there, but the policy has {ours[first]:g}"
     return None
 
 
@@ -122,13 +122,13 @@ def _nested_difference(expected: DictSpec | TupleSpec, actual: gym.Space[Any], *
 
     kind = spaces.Dict if isinstance(expected, DictSpec) else spaces.Tuple
     if not isinstance(actual, kind):
-        return f"is a {type(actual).__name__} there, the policy has a {kind.__name__}"
+        return f"is a {type(actual).__name__} there, but the policy has a {kind.__name__}"
     ours: dict[Any, SpaceSpec] = (
         dict(expected.spaces) if isinstance(expected, DictSpec) else dict(enumerate(expected.spaces))
     )
     theirs: dict[Any, Any] = dict(actual.spaces) if isinstance(actual, spaces.Dict) else dict(enumerate(actual.spaces))
     if set(ours) != set(theirs):
-        return f"has the parts {sorted(map(str, theirs))} there, the policy has {sorted(map(str, ours))}"
+        return f"has the parts {sorted(map(str, theirs))} there, but the policy has {sorted(map(str, ours))}"
     for key, child in ours.items():
         if difference := _difference(child, theirs[key], bounds=bounds):
             return f"part {key} {difference}"
@@ -137,7 +137,7 @@ def _nested_difference(expected: DictSpec | TupleSpec, actual: gym.Space[Any], *
 
 def _contradiction(ours: Sequence[Element], theirs: Sequence[Element]) -> str | None:
     found = contradiction(ours, theirs)
-    return found and f"{found[0]} {found[2]} there, the policy has {found[1]}"
+    return found and f"{found[0]} {found[2]} there, but the policy has {found[1]}"
 
 
 def _described(elements: Any, size: int) -> tuple[Element, ...]:

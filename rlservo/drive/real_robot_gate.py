@@ -61,23 +61,25 @@ def _difference_to(evaluation: Evaluation, env: gym.Env[Any, Any]) -> str | None
     row = f"evaluation {evaluation.disturbance}"
     evaluated, driven = (one.rpartition("/")[2].replace("Sim-v", "-v") for one in (evaluation.env_id, env.spec.id))
     if evaluated != driven.replace("Rob-v", "-v"):
-        return f"{row} is of {evaluation.env_id}, the robot's is {env.spec.id}"
+        return f"{row} is of {evaluation.env_id}, but the robot's is {env.spec.id}"
     for name, here in facts.items():
         there = evaluation.robot.get(name, "unknown")
         if there != here:
-            return f"{row} has {name} {there}, the robot {here}"
+            return f"{row} has {name} {there}, but the robot has {here}"
     collisions = evaluation.endings.get("collision", 0)
     if collisions > PROVEN_COLLISIONS * evaluation.episodes:
         return (
-            f"{row} has {collisions} collisions in {evaluation.episodes} episodes, a real robot takes "
+            f"{row} has {collisions} collisions in {evaluation.episodes} episodes, but a real robot allows "
             f"{PROVEN_COLLISIONS:.0%}"
         )
     measured_ms, evaluated_cycles = env.unwrapped.measured_latency_ms, _action_latency(evaluation.disturbance)  # type: ignore[attr-defined]
     if measured_ms is None:
-        return f"{row} has {evaluated_cycles} cycles of latency, the robot's was never measured"
+        return f"{row} has {evaluated_cycles} cycles of latency, but the robot's was never measured"
     cycles = max(1, math.ceil(measured_ms / 1e3 * float(facts["action_cycle_rate"])))
     if cycles > evaluated_cycles:
-        return f"{row} has {evaluated_cycles} cycles of latency, the robot up to {cycles} ({measured_ms:.0f} ms)"
+        return (
+            f"{row} has {evaluated_cycles} cycles of latency, but the robot has up to {cycles} ({measured_ms:.0f} ms)"
+        )
     return None
 
 

@@ -129,7 +129,7 @@ def describe_unequal(lists: Sequence[Any]) -> str:
         found = form(one)
         if found is None or found != first:
             shape = "has lists of different lengths" if found is None else f"has shape {found}"
-            return f"its parts differ in length: observation {index} of the batch {shape}, the first has {first}"
+            return f"its parts differ in length: observation {index} of the batch {shape}, but the first has {first}"
     return "its lists differ in length"
 
 

@@ -283,7 +283,7 @@ def check_time(bundle: Bundle, run: Run, names: Sequence[str]) -> None:
         taken_s = time.thread_time() - began
         if taken_s > MOST_S:
             raise BundleError(
-                f"{bundle.onnx} took {taken_s:.1f} s of computing for an observation of {number:.0e}: at most "
+                f"{bundle.onnx} computed for {taken_s:.1f} s on an observation of {number:.0e}, and may take at most "
                 f"{MOST_S:g} s, so that no request stops the others: make the network smaller"
             )
 

@@ -267,7 +267,7 @@ class Policy(Closeable):
         if known != rows:
             raise RequestError(
                 f"policy '{self._contract.name}' remembers {known} episode{'s' if known > 1 else ''} and got {rows} "
-                f"observation{'s' if rows > 1 else ''}: call reset() to begin others"
+                f"observation{'s' if rows > 1 else ''}: call reset() to begin new ones"
             )
         if state is not None:
             before = self._state_tensors.parse(state, rows, batch=batch)

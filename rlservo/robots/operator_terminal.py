@@ -42,7 +42,7 @@ class Operator:
         if not self._is_asked:
             return
         if not _has_terminal():
-            raise RobotError(f"{question}: there is no terminal for a confirmation; --yes (confirm=False) confirms")
+            raise RobotError(f"{question}: there is no terminal to confirm at; use --yes (confirm=False)")
         self._ask(question)
 
     def allow_restart(self) -> None:

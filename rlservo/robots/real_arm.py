@@ -174,7 +174,7 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
         else:
             self._robot.hold()
         if self.is_called_off():
-            raise InvalidResetError("the motion to the start was called off")
+            raise InvalidResetError("the motion to the start was cancelled")
 
     def _confirm(self, start: Vector, goal: Vector, target: str) -> None:
         """Ask once for each start that the arm moves to in this run, with the target to which it goes on from there."""

@@ -372,7 +372,7 @@ class _Supervisor(Multiprocess):
                 if not is_said and time.monotonic() - began > PATIENCE_S:
                     is_said = True
                     logger.warning(
-                        "new worker %s still starts: worker %s serves on", new.pid, self.processes[index].pid
+                        "new worker %s is still starting: worker %s keeps serving", new.pid, self.processes[index].pid
                     )
                 time.sleep(0.1)
                 self.keep_subprocess_alive()

@@ -46,7 +46,7 @@ class ActReply(BaseModel):
     session_step: int | None = Field(None, description="Number of this action in the session's episode, from 1.")
     warnings: list[str] | None = Field(None, description="Values out of bounds or limited that were used anyway.")
     timestamp: float | None = Field(None, description="As sent.")
-    received_at: float | None = Field(None, description="The server's clock [s since 1970] when the request came.")
+    received_at: float | None = Field(None, description="The server's clock [s since 1970] when the request arrived.")
     sent_at: float | None = Field(None, description="The same when the reply was written.")
 
 

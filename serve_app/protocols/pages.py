@@ -77,7 +77,7 @@ def routes(table: Callable[[], RoutingTable]) -> list[Route]:
         *(
             Route(GET, path, Access.open, summary, _file(path, file), is_page=path == "/", is_documented=False)
             for path, file in files.items()
-            for summary in [SUMMARIES.get(path, "File of a page")]
+            for summary in [SUMMARIES.get(path, "Asset of the API page")]
         ),
     ]
 

@@ -65,7 +65,7 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
             if not storage.create(f"{bundle.contract.name}/{bundle.contract.version}/{file}", copy):
                 raise ConflictError(
                     f"{target}/{file} holds another file than {bundle.path / file}: the version is being published by "
-                    "another command, or was left unfinished; publish as another version (--version next)"
+                    "another command, or was left unfinished; publish it as another one (--version next)"
                 )
     for attempt in range(ATTEMPTS):
         if storage.create(INDEX, content, tag):
@@ -119,7 +119,8 @@ def _with(index: Index, bundle: Bundle, target: str) -> bytes:
     if there := index.hash_of(bundle):
         which = "this very bundle" if there == bundle.digest else "another bundle"
         raise ConflictError(
-            f"{target} is there already ({which}): versions are never overwritten; publish as another (--version next)"
+            f"{target} already exists ({which}): versions are never overwritten; publish it as another "
+            "one (--version next)"
         )
     name, version = bundle.contract.name, bundle.contract.version
     versions = {**index.policies.get(name, {}), version: bundle.digest}
@@ -138,6 +139,6 @@ def _place(bundle: Bundle, target: Path) -> None:
             folder.rename(target)
     if digest_of(target) != bundle.digest:
         raise ConflictError(
-            f"{target} is there already and holds another bundle: versions are never overwritten; publish as another "
+            f"{target} already exists and holds another bundle: versions are never overwritten; publish it as another "
             "one (--version next)"
         )

@@ -244,7 +244,7 @@ class Repository:
                 with (entry / file).open("wb") as stream:
                     storage.copy(f"{name}/{version}/{file}", most, stream)
             except FileNotFoundError:
-                raise BundleError(f"{place}/{file} is not there: the version was deleted, all or in part") from None
+                raise BundleError(f"{place}/{file} is missing: the version was deleted, all or in part") from None
 
         copy(SUMS_FILE, MAX_SUMS_BYTES)
         found, sums = read_sums(entry)

@@ -51,7 +51,7 @@ def versions(handler: RequestHandler) -> None:
     plan, store = handler.control.plan, handler.control.store
     if plan is None or store is None:
         return
-    show.gauge("rlservo_plan_generation", "Plan that this process follows", plan.generation)
+    show.gauge("rlservo_plan_generation", "Number of the plan that this process follows", plan.generation)
     for policy in store.policies:
         name, version = policy.contract.name, policy.contract.version
         which, is_default = {"policy": name, "version": version}, version == store.default(name)
@@ -74,13 +74,13 @@ def process(handler: RequestHandler) -> None:
     """Sample this process's queue, API keys and recording."""
     admission, keys, show = handler.admission, handler.keys, handler.metrics
     show.gauge("rlservo_uptime_seconds", "Time since this process's start", time.monotonic() - show.began)
-    show.gauge("rlservo_start_time_seconds", "This process's start, since 1970", show.began_at)
+    show.gauge("rlservo_start_time_seconds", "Start of this process, since 1970", show.began_at)
     if (lost := show.lost_workers()) is not None:
-        show.counter("rlservo_workers_lost", "Workers that died, not ended, as each worker sees it", lost)
+        show.counter("rlservo_workers_lost", "Workers that died unexpectedly, as counted in each worker", lost)
     waited = "Largest number of requests that waited for the processor at once, since the start"
     show.gauge("rlservo_queue_longest", waited, admission.longest)
     show.gauge("rlservo_requests_incoming", "Requests whose body is still arriving", admission.incoming)
-    current = "1 while the API keys in use are those of their file; 0 if older keys stay in use"
+    current = "1 while the API keys in use are those in the key file; 0 if older keys stay in use"
     show.gauge("rlservo_api_keys_current", current, keys.current)
     for label, count in keys.limits.refused.items():
         show.counter("rlservo_rate_limited", "Requests refused because their key exceeded its rate", count, key=label)

@@ -104,4 +104,4 @@ def overtaken(request: Request) -> RlservoError:
     shown = f"session '{request.session_id!s:.64}' of policy '{request.policy[:64]}'"
     if request.reset:
         return UnavailableError(f"another request started {shown} at the same time: try again")
-    return SessionError(f"the request belongs to an earlier episode: another one has restarted {shown} since")
+    return SessionError(f"the request belongs to an earlier episode: another request has restarted {shown} since")

@@ -167,7 +167,7 @@ class SetAlias(Command):
             raise ConflictError(f"policy '{name}' has no alias '{alias}': it has {_listed(policy.aliases)}")
         if alias == PRODUCTION:
             raise ConflictError(
-                f"the alias '{PRODUCTION}' of policy '{name}' names the version for clients that name none: point it "
+                f"the alias '{PRODUCTION}' of policy '{name}' is the version that clients get by default: point it "
                 "elsewhere, or unload the policy"
             )
         return _changed(name, policy, aliases={a: v for a, v in policy.aliases.items() if a != alias})
@@ -223,14 +223,16 @@ COMMANDS: dict[str, type[Command]] = {
 class Changed(BaseModel):
     """State of a policy after a command."""
 
-    generation: int = Field(description="The number of the plan with it.")
+    generation: int = Field(description="Number of the plan that contains the change.")
     policy: str
     default: str | None = Field(description="The default version; null when the policy is no longer served.")
     versions: list[str]
     aliases: dict[str, str]
     canary: Canary | None
     shadow: str | None
-    notes: list[str] = Field([], description="Harmless differences of the version that clients get now.")
+    notes: list[str] = Field(
+        [], description="Harmless differences between the version that clients get now and the previous one."
+    )
 
     @classmethod
     def of(cls, plan: Plan, name: str, notes: Sequence[str] = ()) -> Changed:

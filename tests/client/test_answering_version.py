@@ -242,7 +242,7 @@ def test_action_of_a_version_with_other_spaces_is_never_used(
         server.move("2")
         with pytest.raises(
             UnavailableError,
-            match=r"version 2 of policy 'ur5' answers now, and differs from version 1, .*: action has 'joint_5' as "
+            match=r"version 2 of policy 'ur5' now answers, and differs from version 1, .*: action has 'joint_5' as "
             "element 0 instead of 5",
         ):
             client.act(OBS)

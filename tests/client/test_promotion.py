@@ -476,7 +476,7 @@ def test_a_log_tells_whether_a_promotion_has_begun(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("version", "says"),
-    [("9", "has no version 9: expected one of 1, 2, 3, 4"), ("1", "in production already")],
+    [("9", "has no version 9: expected one of 1, 2, 3, 4"), ("1", "already in production")],
 )
 def test_what_cannot_be_promoted_is_refused_before_anything_is_changed(
     run: Any, server: Server, version: str, says: str
@@ -490,10 +490,10 @@ def test_what_cannot_be_promoted_is_refused_before_anything_is_changed(
 def test_a_canary_or_shadow_of_another_operator_is_in_the_way(run: Any, server: Server) -> None:
     with server.admin() as admin:
         admin.shadow("ur5", "4")
-        with pytest.raises(UsageError, match="has a shadow already, 4"):
+        with pytest.raises(UsageError, match="already has a shadow, 4"):
             run(action_difference=0.05)()
         admin.canary("ur5", "2", 0.5)
-    with pytest.raises(UsageError, match=r"has a canary already, 2=0\.5"):
+    with pytest.raises(UsageError, match=r"already has a canary, 2=0\.5"):
         run()()
     assert server.state == ("1", ("2", 0.5), "4")
 
@@ -720,7 +720,7 @@ def test_killed_at_any_moment_and_started_again_it_ends_what_it_began(run: Any, 
         try:
             outcome = promotion(lambda: server.ask(200))
         except UsageError as error:
-            assert moment == "after 'end' is written" and "in production already" in error.message
+            assert moment == "after 'end' is written" and "already in production" in error.message
         else:
             expected = PROMOTED if is_running or not is_begun else STOPPED
             assert (outcome.outcome, outcome.is_finished) == (expected, True), (moment, outcome)

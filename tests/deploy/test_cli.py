@@ -141,7 +141,7 @@ def test_verify_proves_the_bundle_again(policies: Path) -> None:
 
 def test_verify_refuses_another_policys_checkpoint(policies: Path) -> None:
     done = rlservo_here("verify", policies, "--checkpoint", UR5.parent / "mir100_navigation")
-    refused(done, 2, "shape (27,), the checkpoint's have (4,): they do not belong together")
+    refused(done, 2, "shape (27,), but the checkpoint's have (4,): they do not belong together")
 
 
 def test_verify_measures_disturbances_and_writes_them_into_the_contract(bundle: Path, tmp_path: Path) -> None:
@@ -423,7 +423,7 @@ def test_key_makes_a_key_and_the_line_that_the_server_accepts_it_by() -> None:
         (("--max-p99", "20"), "--max-p99 '20': expected a number with its unit, such as 20ms"),
         (("--max-p99", "2s"), "at most 1 s"),
         (("--max-success-drop", "-1%"), "--max-success-drop '-1%'"),
-        (("--max-p99", "20ms", "--canary", "0"), "--canary and --for: expected more than 0"),
+        (("--max-p99", "20ms", "--canary", "0"), "--canary 0, --for 10m: expected both above 0"),
         (("--max-p99", "20ms", "--canary", "110%"), "--canary '110%'"),
         (("--max-p99", "20ms", "--for", "31d"), "--for '31d'"),
         (("--max-p99", "20ms", "--url", "http://127.0.0.1:9"), "http://127.0.0.1:9 cannot be reached"),

@@ -328,11 +328,11 @@ def test_on_episode_sees_each_row_as_it_comes() -> None:
 @pytest.mark.parametrize(
     ("action", "sentence"),
     [
-        ({"shape": (2,)}, r"the action has shape \(1,\) there, the policy has \(2,\)"),
-        ({"high": 2.0}, "the action element 0 has high 1 there, the policy has 2"),
-        ({"low": None}, "the action element 0 has low -1 there, the policy has -inf"),
-        ({"dtype": "int64"}, "the action has dtype float32 there, the policy has int64"),
-        ({"elements": ({"name": "torque"},)}, "the action element 0 is 'step' there, the policy has 'torque'"),
+        ({"shape": (2,)}, r"the action has shape \(1,\) there, but the policy has \(2,\)"),
+        ({"high": 2.0}, "the action element 0 has high 1 there, but the policy has 2"),
+        ({"low": None}, "the action element 0 has low -1 there, but the policy has -inf"),
+        ({"dtype": "int64"}, "the action has dtype float32 there, but the policy has int64"),
+        ({"elements": ({"name": "torque"},)}, "the action element 0 is 'step' there, but the policy has 'torque'"),
     ],
 )
 def test_an_action_space_that_differs_is_refused_in_one_sentence(action: dict[str, Any], sentence: str) -> None:
@@ -343,10 +343,10 @@ def test_an_action_space_that_differs_is_refused_in_one_sentence(action: dict[st
 
 
 def test_an_observation_space_that_differs_is_refused() -> None:
-    with pytest.raises(UsageError, match=r"the observation has shape \(4,\) there, the policy has \(3,\)"):
+    with pytest.raises(UsageError, match=r"the observation has shape \(4,\) there, but the policy has \(3,\)"):
         rollout(pendulum_policy(), "CartPole-v1", episodes=1)
     contract = contract_of(BoxSpec(shape=(1,), dtype="float32", low=-10.0, high=10.0), DiscreteSpec(n=3))
-    with pytest.raises(UsageError, match=r"the action is a Box there, the policy has Discrete\(3\)"):
+    with pytest.raises(UsageError, match=r"the action is a Box there, but the policy has Discrete\(3\)"):
         rollout(WrittenPolicy(contract, lambda _: 0), CORRIDOR, episodes=1)
 
 

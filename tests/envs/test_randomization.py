@@ -346,8 +346,8 @@ def test_impossible_disturbances_are_refused(arguments: dict[str, Any], message:
         ({"base_offset": (0.0, 0.02)}, "no set_base_offset"),
         ({"extreme": "start"}, "no extreme_options"),
         ({"robot_models": ["ur3"]}, "no set_robot_model"),
-        ({"observation_noise": 0.1}, "expected a Box of one dimension"),
-        ({"stuck_sensor": "any"}, "expected a Box of one dimension"),
+        ({"observation_noise": 0.1}, "expected a one-dimensional Box"),
+        ({"stuck_sensor": "any"}, "expected a one-dimensional Box"),
     ],
 )
 def test_what_an_environment_cannot_do_is_named(arguments: dict[str, Any], lack: str) -> None:

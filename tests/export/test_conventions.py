@@ -80,7 +80,7 @@ def test_environment_that_contradicts_or_is_not_understood_is_refused(
 def test_convention_that_no_element_needs_is_refused() -> None:
     named = ElementNames((Element(name="x", quantity="joint position"),) * 4, (Element(name="a"),))
     for name, value in (("quaternion", "wxyz"), ("frame", "base")):
-        with pytest.raises(UsageError, match=f"--convention {name}: no element is known to need it"):
+        with pytest.raises(UsageError, match=f"--convention {name}: no element needs it"):
             with_conventions(named, {name: value}, RECIPE)
     unnamed = with_conventions(ElementNames(), {"action": "relative"}, RECIPE)
     assert unnamed.action == (Element(name="action_0", quantity="relative joint position"),)

@@ -117,14 +117,15 @@ def velocities(_: Side, action: Side) -> None:
 
 
 SWAPS: dict[Callable[[Side, Side], None], str] = {
-    last_first: "the observation elements 15 to 18 are a quaternion w, x, y, z there, the policy has x, y, z, w",
-    degrees: r"the observation element 0 \(base_position_offset\) has unit rad there, the policy has deg",
-    scaled_degrees: r"the action element 0 \(base_position_offset\) has scale 0.5 there, the policy has 0.008726",
-    of_base: r"the observation element 12 \(target_x\) is in frame base_link there, the policy has base",
-    other_joints: r"element 0 \(base_position_offset\) is of shoulder_pan_joint there, the policy has shoulder_lift_",
-    other_names: r"the action element 0 .* is of shoulder_pan_joint there, the policy has shoulder_lift_joint",
-    relative: r"the action element 0 .* is a joint position there, the policy has relative joint position",
-    velocities: r"the action element 0 .* is a joint position there, the policy has joint velocity",
+    last_first: "the observation elements 15 to 18 are a quaternion w, x, y, z there, but the policy has x, y, z, w",
+    degrees: r"the observation element 0 \(base_position_offset\) has unit rad there, but the policy has deg",
+    scaled_degrees: r"the action element 0 \(base_position_offset\) has scale 0.5 there, but the policy has 0.008726",
+    of_base: r"the observation element 12 \(target_x\) is in frame base_link there, but the policy has base",
+    other_joints: r"element 0 \(base_position_offset\) is of shoulder_pan_joint there, but the policy has "
+    "shoulder_lift_",
+    other_names: r"the action element 0 .* is of shoulder_pan_joint there, but the policy has shoulder_lift_joint",
+    relative: r"the action element 0 .* is a joint position there, but the policy has relative joint position",
+    velocities: r"the action element 0 .* is a joint position there, but the policy has joint velocity",
 }
 
 

@@ -59,15 +59,17 @@ def test_evaluation_of_another_arm_does_not_let_a_policy_drive_this_one(
         check_proven(contract.model_copy(update={"evaluations": (evaluation,)}), env)
 
     try:
-        with pytest.raises(UsageError, match=r"has 1 cycles of latency, the robot's was never measured"):
+        with pytest.raises(UsageError, match=r"has 1 cycles of latency, but the robot's was never measured"):
             check("ur5")
-        with pytest.raises(UsageError, match=r"has ur_model ur3, the robot ur5"):
+        with pytest.raises(UsageError, match=r"has ur_model ur3, but the robot has ur5"):
             check("ur3")
-        with pytest.raises(UsageError, match=r"has ur_model unknown, the robot ur5"):
+        with pytest.raises(UsageError, match=r"has ur_model unknown, but the robot has ur5"):
             check("ur5", robot={})
-        with pytest.raises(UsageError, match=r"is of rlservo/EmptyEnvironmentURSim-v0, the robot's is rlservo/EndEff"):
+        with pytest.raises(
+            UsageError, match=r"is of rlservo/EmptyEnvironmentURSim-v0, but the robot's is rlservo/EndEff"
+        ):
             check("ur5", env_id="rlservo/EmptyEnvironmentURSim-v0")
-        with pytest.raises(UsageError, match=r"has 2 collisions in 16 episodes, a real robot takes 5%"):
+        with pytest.raises(UsageError, match=r"has 2 collisions in 16 episodes, but a real robot allows 5%"):
             check("ur5", endings={"success": 14, "collision": 2})
     finally:
         env.close()
@@ -81,6 +83,6 @@ def test_evaluation_of_another_arm_does_not_let_a_policy_drive_this_one(
     assert measured.returncode == 0, measured.stderr
     cycles = json.loads(measured.stdout)["cycles"]
     assert cycles > 2
-    with pytest.raises(UsageError, match=rf"has 1 cycles of latency, the robot up to {cycles} "):
+    with pytest.raises(UsageError, match=rf"has 1 cycles of latency, but the robot has up to {cycles} "):
         check("ur5")
     check("ur5", disturbance=f"latency={cycles},noise=real")

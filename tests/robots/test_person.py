@@ -112,7 +112,7 @@ def test_nothing_moves_without_a_terminal_or_yes(arm: OutsideArm, shipped: Path)
     words = " ".join(output.split())
     assert "from (0.00, -2.50, 1.50, -1.50, -1.40, 0.00) to its start (0.00, -2.50, 1.50" in words
     assert "then the policy moves each joint with at most 0.31 rad/s" in words
-    assert "there is no terminal for a confirmation" in words
+    assert "there is no terminal to confirm at" in words
     arm.recorder.watch(0.5)
     assert arm.recorder.motion().fastest() < 0.005
 

@@ -254,7 +254,9 @@ def test_a_worker_that_dies_during_a_slow_replacement_is_replaced_too(policies: 
         os.kill(slow, signal.SIGSTOP)
         os.kill(max(before), signal.SIGKILL)
         wait_for(lambda: set(worker_pids(run)) - before - {slow}, "another in place of the dead one", timeout_s=60)
-        wait_for(lambda: f"new worker {slow} still starts" in "".join(run.output), "the sentence that it takes long")
+        wait_for(
+            lambda: f"new worker {slow} is still starting" in "".join(run.output), "the sentence that it takes long"
+        )
         os.kill(slow, signal.SIGCONT)
         wait_for(lambda: not before & set(now := worker_pids(run)) and len(now) == 2, "new workers", poll_s=0.2)
         assert run.end(signal.SIGTERM) == 0

@@ -79,7 +79,7 @@ class ArmRobot(ABC, Generic[Simulation]):
         self._float_params, self._string_params = floats, strings
         if self.simulation.place(joints) and self.is_real:
             links = " and ".join(self.simulation.contacts()[0])
-            raise ValueError(f"a real arm is not moved to a pose in which {links} would touch")
+            raise ValueError(f"a real arm cannot be moved to a pose in which {links} would touch")
         self.simulation.move_objects(paths)
         self.simulation.settle()
         return SETTLE_CYCLES

@@ -143,7 +143,7 @@ def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> Ob
     if kind.__name__ == "MeanStdFilter":
         if files.has_pipelines and not (files.env_to_module / kind.__name__).is_dir():
             raise CheckpointError(
-                f"{files.env_to_module / kind.__name__} is missing: the observation filter's statistics"
+                f"{files.env_to_module / kind.__name__} is missing: it holds the observation filter's statistics"
             )
         private_names.replace(piece, "_update_stats", False)  # it would continue learning from whatever it is shown
         return None if isinstance(space, Discrete | MultiDiscrete) else _filter(piece, space, slot)
@@ -161,7 +161,7 @@ def _observation_step(piece: Any, files: CheckpointFiles, slot: AgentSlot) -> Ob
         choices = slot.part(piece.input_action_space)
         if not isinstance(choices, Discrete):
             raise UnsupportedError(
-                f"{kind.__name__} on the action space {choices} is not exported: RLlib's is Discrete"
+                f"{kind.__name__} on the action space {choices} is not exported: expected a Discrete one"
             )
         keys = (piece.ORIG_OBS_KEY, piece.PREV_ACTIONS_KEY, piece.PREV_REWARDS_KEY)
         return Previous(int(piece.n_prev_actions), int(choices.n), int(piece.n_prev_rewards), keys)

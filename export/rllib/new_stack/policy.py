@@ -271,7 +271,7 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     if is_repeatable and not _acts_alike(forward, _forward_once(acting, draft)):
         raise UnsupportedError(
             f"module {name} acts differently when it is built for inference only, as RLlib's actors build it: make "
-            "both act alike"
+            "both act the same"
         )
     distribution, mode, names = _action_rule(module, forward, action_space, notify)
     recipe = dataclasses.replace(draft, mode=mode, distribution=distribution)

@@ -129,8 +129,8 @@ def merged(annotations: Sequence[Annotation]) -> Annotation:
                 result = replace(result, **{name: theirs})
             elif theirs and name in COMPARED and not _alike(ours, theirs):
                 raise CheckpointError(
-                    f"{result.place} has the {COMPARED[name]} {_text(ours)}, {other.place} {_text(theirs)}: they are "
-                    "not of the same policy; take one of them away"
+                    f"{result.place} has the {COMPARED[name]} {_text(ours)}, but {other.place} has {_text(theirs)}: "
+                    "they do not describe the same policy; remove one of them"
                 )
     return result
 
@@ -167,7 +167,7 @@ def _each(place: str, what: str, given: Any, size: int) -> Numbers:
     """Return a number for each element. Raises CheckpointError for a list of another length."""
     numbers = tuple(float(number) for number in given) if isinstance(given, list) else (float(given),) * size
     if len(numbers) != size:
-        raise CheckpointError(f"{place}: {what} has {len(numbers)} numbers, the action {size} elements")
+        raise CheckpointError(f"{place}: {what} has {len(numbers)} numbers, but the action has {size} elements")
     if not np.isfinite(numbers).all():
         raise CheckpointError(f"{place}: {what} is not finite: {_text(numbers)}")
     return numbers
@@ -194,7 +194,8 @@ def _mjlab(place: str, metadata: Mapping[str, str], size: int, joint_order: Sequ
         )
     if robot and len(joints) != size:
         raise CheckpointError(
-            f"{place}: joint_names has {len(robot)} joints, the action {size} elements: --joint-order names those "
+            f"{place}: joint_names has {len(robot)} joints, but the action has {size} elements: "
+            "--joint-order names those "
             "that the action moves, in its order"
         )
     clause = metadata.get("action_term") or metadata.get("action_type") or ""
@@ -284,7 +285,7 @@ def _deploy(file: Path, size: int, joint_order: Sequence[str]) -> Annotation:
     default = described["default_joint_pos"]
     if joint_order and len(joint_order) != len(default):
         raise CheckpointError(
-            f"{file}: default_joint_pos has {len(default)} joints, the joint order that was given {len(joint_order)}"
+            f"{file}: default_joint_pos has {len(default)} joints, but the given joint order has {len(joint_order)}"
         )
     actions = []
     for name, term in described["actions"].items():
@@ -292,7 +293,7 @@ def _deploy(file: Path, size: int, joint_order: Sequence[str]) -> Annotation:
         actions.append((name, list(joints), len(term["scale"]), term))
     total = sum(count for _, _, count, _ in actions)
     if total != size:
-        raise CheckpointError(f"{file}: the actions' scale has {total} numbers, the action {size} elements")
+        raise CheckpointError(f"{file}: the actions' scale has {total} numbers, but the action has {size} elements")
     terms = [
         Term(name, name, len(term["scale"]), tuple(joint_order) if len(term["scale"]) == len(default) else (),
              default if name == "joint_pos_rel" else [0.0] * len(default), term["scale"],
@@ -349,8 +350,8 @@ def _policy_package(file: Path, manifest: Mapping[str, Any]) -> Annotation:
             [f"the runner {kind}"] if not around else [str(one.get("type") or one.get("class_path")) for one in around]
         )
         raise UnsupportedError(
-            f"{file}: {', '.join(what)} is not in the graph, which would act otherwise without it: export the model "
-            "with it inside, one action a step"
+            f"{file}: {', '.join(what)} is not in the graph, which would act differently without it: export the "
+            "model with it inside, with one action per step"
         )
     robots = (manifest.get("hardware") or {}).get("robots") or [{}]
     state, action = robots[0].get("state") or {}, robots[0].get("action") or {}

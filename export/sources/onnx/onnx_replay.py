@@ -65,7 +65,7 @@ def golden_sets(file: Path, session: Any) -> int:
         sides = session.get_inputs(), session.get_outputs()
         if (len(given), len(wanted)) != (len(sides[0]), len(sides[1])):
             raise CheckpointError(
-                f"{folder} has {len(given)} inputs and {len(wanted)} outputs, {file.name} {len(sides[0])} and "
+                f"{folder} has {len(given)} inputs and {len(wanted)} outputs, but {file.name} has {len(sides[0])} and "
                 f"{len(sides[1])}: expected one file for each, input_0.pb and so on"
             )
         feed = dict(zip([one.name for one in sides[0]], given, strict=True))
@@ -76,8 +76,9 @@ def golden_sets(file: Path, session: Any) -> int:
         for one, ours, theirs in zip(sides[1], found, wanted, strict=True):
             if ours.shape != theirs.shape or not np.allclose(ours, theirs, 1e-4, 1e-5):
                 raise CheckpointError(
-                    f"{folder.name} beside {file} has another '{one.name}' than onnxruntime gives: "
-                    f"{theirs.ravel()[:3].tolist()} ..., {ours.ravel()[:3].tolist()} ...: they do not belong together"
+                    f"{folder.name} beside {file} has '{one.name}' {theirs.ravel()[:3].tolist()} ..., but "
+                    "onnxruntime gives "
+                    f"{ours.ravel()[:3].tolist()} ...: they do not belong together"
                 )
     return len(folders)
 

@@ -191,7 +191,7 @@ def _elements(said: Annotation, recipe: Recipe, main: StageTensor | None, joint_
     size = int(np.prod(recipe.action_space.shape))
     joints = said.joints or tuple(joint_order)
     if joints and len(joints) != size:
-        raise CheckpointError(f"the joint order has {len(joints)} joints, the action {size} elements")
+        raise CheckpointError(f"the joint order has {len(joints)} joints, but the action has {size} elements")
     if joint_order and list(joints) != [joint for joint in joint_order if joint in joints]:
         raise CheckpointError(
             f"the joint order that was given ({', '.join(joint_order)}) is not that of {said.place} "

@@ -69,14 +69,14 @@ def describe_graph(
         if name != chosen[0] and valued and name not in uses:
             raise UsageError(
                 f"{file.name}: the output '{name}' has the shape of '{valued[0]}', an input with a value of its own: "
-                "if it is its value at the next step, export the model without that value, else give "
+                "if the output is that input at the next step, export the model without the value; otherwise give "
                 f"--output {name}=none"
             )
         twins = [one for one in inputs if one not in pairs and inputs[one].shape == outputs[name].shape]
         if name != chosen[0] and twins and name not in uses:
             raise UsageError(
-                f"{file.name}: the output '{name}' has the shape of the input '{twins[0]}': if it is its value at the "
-                f"next step, give --output {name}={twins[0]}, else --output {name}=none"
+                f"{file.name}: the output '{name}' has the shape of the input '{twins[0]}': if it is that input at the "
+                f"next step, give --output {name}={twins[0]}, otherwise --output {name}=none"
             )
     read = _inputs_of(graph, [chosen[0], *pairs.values()])
     used = {

@@ -99,7 +99,7 @@ class RosAddress:
         for setting in settings:
             name, equals, value = setting.partition("=")
             if not equals or name not in options:
-                raise RobotError(f"robot {robot!r}: {setting!r} is not one of {', '.join(options)} with =VALUE")
+                raise RobotError(f"robot {robot!r}: {setting!r}: expected NAME=VALUE with one of {', '.join(options)}")
             if name in CHOICES and value not in CHOICES[name]:
                 raise RobotError(f"robot {robot!r}: {name} is {value!r}, expected {' or '.join(CHOICES[name])}")
             pattern, expected = FORMS.get(name, (TOPIC, "a topic's name"))

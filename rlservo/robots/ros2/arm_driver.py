@@ -71,7 +71,7 @@ class RosArmConnection:
         self._limits = settings.limits
         self.rate_hz = settings.limits.rate_hz or RATE_HZ[self._how]
         if self._how == "trajectory" and self.rate_hz < SLOWEST_HZ:
-            raise RobotError(f"rate_hz is {self.rate_hz:g}: trajectories need at least {SLOWEST_HZ:g} a second")
+            raise RobotError(f"rate_hz is {self.rate_hz:g}: trajectories need at least {SLOWEST_HZ:g} Hz")
         self.following = FOLLOWING[self._how]
         self._joints = [address["prefix"] + name for name in JOINT_NAMES.values()]
         self._state: tuple[float, float | None, Vector, Vector] | None = None  # stamp, age, positions, velocities
@@ -139,7 +139,7 @@ class RosArmConnection:
         """Return why no new state comes, as a fault."""
         topic, silent_s = self._address["joint_states"], time.monotonic() - self._came_s
         if time.monotonic() - self._heard_s > WATCH_S:
-            return f"connection_lost: no message on {topic} for {silent_s:.0f} s: is the driver running"
+            return f"connection_lost: no message on {topic} for {silent_s:.0f} s: is the driver running?"
         if self._problem:
             return f"bad_messages: {self._problem}"
         return f"stale_stamps: {topic} has no new stamp for {silent_s:.1f} s: check its driver's clock"

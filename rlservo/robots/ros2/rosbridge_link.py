@@ -38,7 +38,7 @@ class RosbridgeLink:
         except OSError as error:
             reason = error.strerror or "no answer"
             raise RobotError(
-                f"no rosbridge answers at {host}:{port} ({reason}): is the robot switched on and on this network"
+                f"no rosbridge answers at {host}:{port} ({reason}): is the robot switched on and on this network?"
             ) from error
         self._ros: Any = roslibpy.Ros(host, port)
         self._topics: list[Any] = []

@@ -134,7 +134,9 @@ class Grpc:
     def _begin(self, method: str, context: Any) -> Request:
         """Return a call's request, whose content is still to be read. Raises ForbiddenError, UnauthenticatedError."""
         if self._local_only and not is_local(context.peer()):
-            raise ForbiddenError("this server accepts only clients on its machine: set http_options.host for others")
+            raise ForbiddenError(
+                "this server accepts only clients on its own machine: set http_options.host for others"
+            )
         headers: dict[bytes, bytes] = {}
         for name, value in context.invocation_metadata():
             headers.setdefault(name.encode(), value.encode() if type(value) is str else value)

@@ -91,7 +91,7 @@ class Parameters(Options, total=False):
     sequence_start: bool | None
     sequence_end: bool | None
     state_policy: Annotated[str | None, Field(description="From the reply that had the states.")]
-    timeout: Annotated[int | None, Field(ge=0, lt=2**64, description="[us] Triton's: how long it may wait.")]
+    timeout: Annotated[int | None, Field(ge=0, lt=2**64, description="[us] Triton's: how long the request may wait.")]
     priority: Annotated[Any, Field(description="Ignored: there is no queue.")]
     headers: Annotated[Any, Field(description="Ignored.")]
     content_type: Annotated[Any, Field(description="Ignored.")]

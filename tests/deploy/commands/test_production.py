@@ -90,7 +90,7 @@ def test_a_plan_of_the_policys_own_folder_counts_and_one_that_contradicts_it_is_
 def test_plan_that_cannot_be_read_or_names_no_bundle_is_refused(repository: Path) -> None:
     newest = max((repository / ".plan").iterdir())
     shutil.rmtree(repository / "ur5" / "1")
-    with pytest.raises(BundleError, match=rf"{newest} has version 1 of 'ur5' in production, which is not there"):
+    with pytest.raises(BundleError, match=rf"{newest} has version 1 of 'ur5' in production, which does not exist"):
         Policy.load(repository / "ur5")
     newest.write_text("{")
     with pytest.raises(BundleError, match=rf"{newest} is not a plan that can be read"):

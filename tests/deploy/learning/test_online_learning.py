@@ -307,7 +307,7 @@ def test_a_version_goes_to_production_by_its_canary_or_learning_goes_on(cell: Ce
     with cell.run_folder() as run, pytest.raises(KeyboardInterrupt):  # no robot acts while it is watched
         cell.learning(run, canary=canary, say=stop).run()
     assert cell.aliases() == {"production": "3"} and "learning continues from version 3" in cell.said
-    assert any("robots do not get version 4: " in line for line in cell.said)
+    assert any("the server does not serve version 4: " in line for line in cell.said)
 
 
 def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:

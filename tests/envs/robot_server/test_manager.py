@@ -64,7 +64,7 @@ def test_line_that_cannot_be_honoured_is_answered_with_the_reason(
     manager: ServerManager, client: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     for line, reason in (
-        (f"{UR} colour:=red", "launch arguments that are not known: colour"),
+        (f"{UR} colour:=red", "unknown launch arguments: colour"),
         ("roslaunch ur_robot_server ur_robot_server.launch ur_model:=ur99", "ur_model 'ur99' does not exist"),
         (f"{UR} action_cycle_rate:=5000", "action_cycle_rate is 5000 Hz: expected 0.1 to 1000 Hz"),
         ("", "expected 'roslaunch"),

@@ -206,7 +206,7 @@ def test_a_ray_that_filters_in_another_way_is_refused(change: str, monkeypatch: 
     monkeypatch.setattr(RunningStat, change, lambda *_: 1.0)
     check_filter.cache_clear()
     try:
-        with pytest.raises(UsageError, match=r"^Ray [\d.]+ filters observations in another way"):
+        with pytest.raises(UsageError, match=r"^Ray [\d.]+ filters observations differently"):
             runner(PPOConfig(), "Pendulum-v1", 1, batched=True, filtered=True)
     finally:
         check_filter.cache_clear()

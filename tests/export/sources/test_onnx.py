@@ -330,8 +330,9 @@ def test_a_manifests_facts_are_the_contracts(tmp_path: Path) -> None:
     ("origin", "changed", "kind", "words"),
     [
         (mjlab, {"joint_names": "pan,lift", "default_joint_pos": "0.1,0.2"}, CheckpointError,
-         "joint_names has 2 joints, the action 3 elements: --joint-order"),
-        (mjlab, {"action_scale": "0.500,0.250"}, CheckpointError, "action_scale has 2 numbers, the action 3 elements"),
+         "joint_names has 2 joints, but the action has 3 elements: --joint-order"),
+        (mjlab, {"action_scale": "0.500,0.250"}, CheckpointError,
+         "action_scale has 2 numbers, but the action has 3 elements"),
         (mjlab, {"default_joint_pos": "0.1,0.2"}, CheckpointError,
          "joint_names has 3 entries, default_joint_pos has 2"),
         (mjlab, {"observation_terms_scale": "1.000"}, CheckpointError,
@@ -345,7 +346,7 @@ def test_a_manifests_facts_are_the_contracts(tmp_path: Path) -> None:
         (physicalai, {"runner": {"type": "action_chunking", "chunk_size": 100}}, UnsupportedError,
          "the runner action_chunking is not in the graph"),
         (unitree, {"default_joint_pos": [0.0, 0.1]}, CheckpointError,
-         "default_joint_pos has 2 joints, the joint order that was given 3"),
+         "default_joint_pos has 2 joints, but the given joint order has 3"),
         (isaac_lab, {"scene": {"dt": "soon"}}, CheckpointError, "IO_descriptors.yaml is not as its exporter writes it"),
     ],
 )  # fmt: skip
@@ -364,7 +365,9 @@ def test_two_files_that_differ_are_refused_with_both_values(tmp_path: Path) -> N
     described["actions"][0] |= {"scale": 0.25, "clip": None}
     (tmp_path / "io_descriptors").mkdir()
     (tmp_path / "io_descriptors" / "IO_descriptors.yaml").write_text(yaml.safe_dump(described))
-    with pytest.raises(CheckpointError, match=r"has the control rate 100.0, .*deploy.yaml 50.0: they are not of the"):
+    with pytest.raises(
+        CheckpointError, match=r"has the control rate 100.0, .*deploy.yaml has 50.0: they do not describe the"
+    ):
         export(given, tmp_path / "out")
 
 

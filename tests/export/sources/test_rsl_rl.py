@@ -347,7 +347,7 @@ def test_mjlab_names_its_parts_otherwise(tmp_path: Path, notices: list[str]) -> 
     listed = {"joint_names": list(JOINTS), "preserve_order": True}
     (tmp_path / "run" / "params" / "env.yaml").write_text(yaml.dump(mjlab(listed, {".*": 0.0})))
     shutil.rmtree(tmp_path / "out")
-    refuse(tmp_path / "run", "some releases of mjlab do not heed", joint_order=ROBOT)
+    refuse(tmp_path / "run", "some releases of mjlab ignore", joint_order=ROBOT)
     refuse(tmp_path / "run", "give --joint-order")
 
 
@@ -662,7 +662,7 @@ def test_policy_of_isaac_lab_3_does_not_drive_our_isaac_reach(tmp_path: Path, no
     from rlservo.drive.control_loop import rollout
 
     for version, words in (
-        ("3", "are a quaternion w, x, y, z there, the policy has x, y, z, w"),
+        ("3", "are a quaternion w, x, y, z there, but the policy has x, y, z, w"),
         ("2", "element 12 is"),
     ):
         env = reach_task(version)

@@ -395,7 +395,7 @@ class TestBroken:
     def test_statistics_of_other_observations(self, model: Path) -> None:
         vec, _ = normalized(OPEN, BOX)
         vec.save(model.with_name("vecnormalize.pkl"))
-        self.refused(model, r"statistics are for observations \(3,\), the model's are \(4,\): they do not belong")
+        self.refused(model, r"statistics are for observations \(3,\), but the model's are \(4,\): they do not belong")
 
     def test_statistics_that_are_none(self, model: Path) -> None:
         model.with_name("vecnormalize.pkl").write_bytes(pickle.dumps({"mean": 0}))

@@ -161,9 +161,9 @@ class Branching(nn.Module):
     [
         (network(3), {}, UnsupportedError, r"action of shape \(2, 3\), the action space .* expects \(2, 2\)"),
         (nn.Linear(5, 2), {}, UnsupportedError, "Linear does not run on an observation of Box"),
-        (network(), {"scale": [1, 2, 3]}, UsageError, r"scale has shape \(3,\), the action \(2,\)"),
+        (network(), {"scale": [1, 2, 3]}, UsageError, r"scale has shape \(3,\), but the action has \(2,\)"),
         (network(), {"scale": np.nan}, UsageError, "scale is not finite"),
-        (network(), {"action_names": ["pan"]}, UsageError, "1 action names were given, the space has 2 elements"),
+        (network(), {"action_names": ["pan"]}, UsageError, "1 action names were given, but the space has 2 elements"),
         (network(), {"action_units": ["rad"]}, UsageError, "0 action names and 1 units were given"),
         (network(), {"state": {"h": np.zeros(2, np.float32)}}, UnsupportedError, "does not run on an observation"),
         (network().state_dict(), {}, UsageError, "a OrderedDict is not a torch module"),

@@ -130,7 +130,7 @@ def test_every_trajectory_is_one_that_a_controller_takes(driver: Driver, speed: 
 
 
 def test_trajectories_that_brake_between_two_commands_are_refused(driver: Driver) -> None:
-    with pytest.raises(RobotError, match="rate_hz is 10: trajectories need at least 20 a second"):
+    with pytest.raises(RobotError, match="rate_hz is 10: trajectories need at least 20 Hz"):
         RosArmConnection(
             replace(SETTINGS, host="ros2:command=trajectory", limits=Limits(rate_hz=10.0, watchdog_hz=1.0))
         )

@@ -121,10 +121,10 @@ def test_a_published_version_is_found_fetched_once_and_proven(made: Path, storag
 
 def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage: Storage) -> None:
     put(made, storage.uri, "1")
-    with pytest.raises(ConflictError, match=r"ur5/1 is there already \(this very bundle\)"):
+    with pytest.raises(ConflictError, match=r"ur5/1 already exists \(this very bundle\)"):
         put(made, storage.uri, "1")
     other = load_bundle(made / "other" / "ur5" / "1")
-    with pytest.raises(ConflictError, match=r"ur5/1 is there already \(another bundle\): versions are never over"):
+    with pytest.raises(ConflictError, match=r"ur5/1 already exists \(another bundle\): versions are never over"):
         publish(other, storage.uri)
     assert next_version(storage.uri, "ur5") == "2" and next_version(storage.uri, "mir") == "1"
     storage.change("DELETE", INDEX)  # as if left half-way: no server sees it, and its number is not free
@@ -270,7 +270,7 @@ LIES: dict[str, tuple[Lie, str]] = {
     ),
     "deleted": (
         only("2/policy.onnx", lambda *_: (404, {}, b"<Error><Code>NoSuchKey</Code><Message>gone</Message></Error>")),
-        r"/policies/ur5/2/policy\.onnx is not there: the version was deleted",
+        r"/policies/ur5/2/policy\.onnx is missing: the version was deleted",
     ),
     "endless object": (
         only("2/SHA256SUMS", endless),
@@ -647,10 +647,10 @@ def test_a_folder_is_published_to_at_once_and_served_by_path_file_uri_and_http(m
     folder.mkdir()
     put(made, f"file://{folder}", "1")
     put(made, str(folder), "2")
-    with pytest.raises(ConflictError, match=r"ur5/1 is there already \(another bundle\)"):
+    with pytest.raises(ConflictError, match=r"ur5/1 already exists \(another bundle\)"):
         publish(load_bundle(made / "other" / "ur5" / "1"), str(folder))
     (folder / INDEX).unlink()
-    with pytest.raises(ConflictError, match="ur5/1 is there already and holds another bundle"):
+    with pytest.raises(ConflictError, match="ur5/1 already exists and holds another bundle"):
         publish(load_bundle(made / "other" / "ur5" / "1"), str(folder))
     put(made, str(folder), "1", "2")  # only their lines were missing
     assert next_version(str(folder), "ur5") == "3"

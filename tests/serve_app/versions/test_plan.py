@@ -138,7 +138,7 @@ def test_what_is_in_use_at_the_start_is_written_down_and_a_load_never_changes_it
 
 def test_production_is_moved_but_neither_removed_nor_unloaded_nor_exchanged() -> None:
     now = made(planned({}))
-    with pytest.raises(ConflictError, match="for clients that name none: point it elsewhere, or unload the policy"):
+    with pytest.raises(ConflictError, match="that clients get by default: point it elsewhere, or unload the policy"):
         alias(now, "ur5", "production", None)
     with pytest.raises(ConflictError, match="version 10 is in use by the alias 'production'"):
         unload(now, "ur5", "10")
