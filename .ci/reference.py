@@ -205,9 +205,8 @@ def http_api() -> str:
     text = ["# HTTP API", NOTE]
     text.append(
         paragraph(
-            "Every route: `open` needs no key, `act` needs one of the server's keys if it has any, "
-            "`admin` an admin key. "
-            "[Protocols](protocols.md) explains the fields."
+            "Every route: `open` needs no key, `act` needs one of the server's keys if it has any, `admin` an admin "
+            "key. [Protocols](protocols.md) explains the fields."
         )
     )
     routes = [each for each in app.table.routes if not each.path.startswith("/page/")]

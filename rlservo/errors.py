@@ -211,7 +211,7 @@ class LateError(UnavailableError):
 
 
 class ConflictError(RlservoError):
-    """A change that contradicts the versions served now."""
+    """The change contradicts the versions served now."""
 
     code = "conflict"
 

@@ -199,8 +199,8 @@ def check_conventions(
             if found := contradiction([element], [carried]):
                 what = found[0].partition(") ")[2] or "is the quaternion's part"
                 raise UsageError(
-                    f"policy {contract.name!r}: {side} element {element.name!r} {what} {found[1]}, but "
-                    f"{place.topic} {place.field} {what} {found[2]}"
+                    f"policy {contract.name!r}: {side} element {element.name!r} {what} {found[1]}, but {place.topic} "
+                    f"{place.field} {what} {found[2]}"
                 )
 
 

@@ -163,9 +163,8 @@ def _check_names(arguments: Mapping[str, str], known: set[str], only: Mapping[st
     if unknown:
         more = f" and {len(unknown) - 5} more" if unknown[5:] else ""
         raise ValueError(
-            f"unknown launch arguments: {', '.join(name[:50] for name in unknown[:5])}{more}; "
-            f"expected some of {', '.join(sorted(expected))}"
-            + (", object_<i>_model_name, object_<i>_frame" if has_objects else "")
+            f"unknown launch arguments: {', '.join(name[:50] for name in unknown[:5])}{more}; expected some of "
+            f"{', '.join(sorted(expected))}" + (", object_<i>_model_name, object_<i>_frame" if has_objects else "")
         )
     for name, values in only.items():
         if name in arguments and arguments[name].lower() not in values:

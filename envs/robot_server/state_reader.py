@@ -68,8 +68,8 @@ def env_of(state: RobotState) -> str:
         has_cubes = any(state.values[CUBES])
         return f"rlservo/{'ObstacleAvoidance' if has_cubes else 'NoObstacleNavigation'}Mir100Sim-v0"
     raise RobotServerError(
-        f"the state has {len(state.values)} numbers: expected the named state of a UR arm or a Panda, or "
-        f"the {STATE_LENGTH} numbers of a MiR100"
+        f"the state has {len(state.values)} numbers: expected the named state of a UR arm or a Panda, or the "
+        f"{STATE_LENGTH} numbers of a MiR100"
     )
 
 

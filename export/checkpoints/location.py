@@ -227,8 +227,8 @@ def _find_root(given: Path) -> Path:
         names = ", ".join(trial.name for trial in trials[:4]) + (", ..." if len(trials) > 4 else "")
         raise CheckpointError(f"{given} holds {len(trials)} trials with checkpoints ({names}): name one of them")
     raise CheckpointError(
-        f"{given} {NO_CHECKPOINT}: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), "
-        "policies/ (the old stack) and checkpoint_NNNNNN/ (a Tune trial), and found none of them"
+        f"{given} {NO_CHECKPOINT}: looked for {MODULES}/ (an algorithm checkpoint of the new API stack), policies/ "
+        "(the old stack) and checkpoint_NNNNNN/ (a Tune trial), and found none of them"
     )
 
 
@@ -282,9 +282,8 @@ def _check_complete(files: CheckpointFiles) -> None:
     )
     if (files.root / TRAINING_RUNNER).is_dir() and files.has_root_pipelines:
         raise CheckpointError(
-            f"{files.root} has connectors both in {TRAINING_RUNNER}/ and at its root, saved by two "
-            "training runs: only one "
-            "of them belongs to the weights; remove the other"
+            f"{files.root} has connectors both in {TRAINING_RUNNER}/ and at its root, saved by two training runs: "
+            "only one of them belongs to the weights; remove the other"
         )
     if files.has_pipelines:
         needed += pipelines

@@ -193,7 +193,7 @@ def _recurrent(program: Program, node: Node) -> None:
     if unusual or names[4] or names[7] or "clip" in given or "activations" in given or (
         not lstm and not given["linear_before_reset"]
     ):  # fmt: skip
-        raise refused(node.op, "not forward, of several rows, or with other gates than torch's")
+        raise refused(node.op, "not forward, of several rows, or with gates other than torch's")
     program.kernels |= {"tanh", "sigmoid", node.op.lower()}
     b = np.broadcast_to(b, (1, 2 * gates))[0]
     both = program.temporary(np.float32, width + hidden)  # the input, then the memory

@@ -204,8 +204,8 @@ def _check(
     if (here != there).any():
         row = int(np.flatnonzero(here != there)[0])
         raise ParityError(
-            f"observation {first + row}: the compiled policy {'refuses' if here[row] else 'gives'} an action "
-            f"that onnxruntime {'gives' if here[row] else 'must not give'}"
+            f"observation {first + row}: the compiled policy {'refuses' if here[row] else 'gives'} an action that "
+            f"onnxruntime {'gives' if here[row] else 'must not give'}"
         )
     name = max(shares, key=lambda each: float(shares[each].max(initial=0.0)))
     if not shares[name].max(initial=0.0) <= 1.0:

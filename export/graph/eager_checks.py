@@ -71,8 +71,8 @@ def check_eager(graph: PolicyGraph, example: Inputs) -> None:
         raise UnsupportedError(f"the network does not run: {first_line(error)}{raised_at(error)}") from error
     if drawn:
         raise UnsupportedError(
-            "the network draws random numbers even without exploring, which an exported policy cannot do: remove "
-            "the noise"
+            "the network draws random numbers even without exploring, which an exported policy cannot do: remove the "
+            "noise"
         )
     for name, tensor, after in zip(graph.input_names, tensors, given, strict=True):
         if not torch.equal(tensor, after):

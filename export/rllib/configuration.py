@@ -69,8 +69,8 @@ def check_own_code(files: CheckpointFiles, config: Any, notify: Callable[[str], 
     """
     if (runner := config.env_runner_cls) is not None and not _is_known(runner):
         raise UnsupportedError(
-            f"{files.root}: its env runner is {runner.__module__}.{runner.__name__}, and only the steps of RLlib's own "
-            "env runners are exported: put your own steps into connectors, or into the module"
+            f"{files.root}: its env runner is {runner.__module__}.{runner.__name__}, and only the steps of RLlib's "
+            "own env runners are exported: put your own steps into connectors, or into the module"
         )
     classes = config.callbacks_class if isinstance(config.callbacks_class, list) else [config.callbacks_class]
     own = [kind.__name__ for kind in [*classes, config.algo_class] if isinstance(kind, type) and not _is_known(kind)]

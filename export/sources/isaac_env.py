@@ -218,8 +218,8 @@ def _joints(term: Mapping[str, Any], robot: Sequence[str] | None) -> list[str]:
     listed = sorted(natural, key=lambda joint: matched[joint])  # stable: the robot's order within a pattern
     if keeps and not heeds and listed != natural:
         raise ValueError(
-            f"has preserve_order, which some releases of mjlab ignore, and lists {shown} in another order than "
-            f"the robot's ({', '.join(natural)}): delete params/env.yaml to export the policy's own numbers"
+            f"has preserve_order, which some releases of mjlab ignore, and lists {shown} in an order other than the "
+            f"robot's ({', '.join(natural)}): delete params/env.yaml to export the policy's own numbers"
         )
     return listed if heeds else natural
 
@@ -315,8 +315,8 @@ def _compare(file: Path, terms: Mapping[str, _Term]) -> None:
                 theirs = [theirs] * len(ours)
             if isinstance(theirs, list) and not _alike(ours, theirs):
                 raise CheckpointError(
-                    f"action term '{name}' has the {what} {ours} in {file}, but {theirs} in {described}: they are "
-                    "not from the same run"
+                    f"action term '{name}' has the {what} {ours} in {file}, but {theirs} in {described}: they are not "
+                    "from the same run"
                 )
 
 

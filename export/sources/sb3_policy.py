@@ -322,9 +322,10 @@ def find_layout(file: Path, model_space: Any, vec: Any, frames: int) -> Layout:
     models = _leaves(model_space)
     statistics = _leaves(vec.observation_space) if vec is not None else {}
     if statistics and dict.fromkeys(statistics) != dict.fromkeys(models):
-        raise CheckpointError(f"{file}: VecNormalize's statistics cover the parts "
-        f"{', '.join(statistics)}, but the model "
-                              f"takes {', '.join(models)}: they do not belong together")  # fmt: skip
+        raise CheckpointError(
+            f"{file}: VecNormalize's statistics cover the parts {', '.join(statistics)}, but the model takes "
+            f"{', '.join(models)}: they do not belong together"
+        )
     stacked: dict[str, tuple[Any, int]] = {}
     frame_spaces: dict[str, Any] = {}
     transposed: list[str] = []

@@ -155,9 +155,8 @@ def _affine(spec: ModuleSpec) -> Affine | None:
             sides.append(np.ascontiguousarray(np.broadcast_to(values, spec.action_space.shape)))
         except ValueError:
             raise UsageError(
-                f"{name} has shape {values.shape}, but the action has {spec.action_space.shape}: expected "
-                "one number, or one "
-                "for each element"
+                f"{name} has shape {values.shape}, but the action has {spec.action_space.shape}: expected one number, "
+                "or one for each element"
             ) from None
         if not np.isfinite(values).all():
             raise UsageError(f"{name} is not finite: {values}")

@@ -177,8 +177,8 @@ def second(module: nn.Module, what: str) -> nn.Module:
         raise UnsupportedError(f"{what}: {type(module).__name__} cannot be copied: {first_line(error)}") from error
     if kept := changed(dict(kept_values(module)), dict(kept_values(copied))).removeprefix("."):
         raise UnsupportedError(
-            f"{what}: a copy of the {type(module).__name__} has another '{kept}' than itself, and copies are what is "
-            "exported and proven: correct its __deepcopy__ or __getstate__"
+            f"{what}: a copy of the {type(module).__name__} has a different '{kept}', and copies are what is exported "
+            "and proven: correct its __deepcopy__ or __getstate__"
         )
     return copied
 

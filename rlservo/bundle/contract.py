@@ -46,7 +46,7 @@ class StateSpec(FrozenModel):
     kind: Literal["recurrent", "frames", "previous_actions", "previous_rewards"] = Field(
         "recurrent",
         description="'previous_actions' holds the last actions' one-hot codes, oldest first: a caller that sends "
-        "another action than the graph's `action` (exploring) overwrites the last code with that action's",
+        "an action other than the graph's `action` (exploring) overwrites the last code with that action's",
     )
 
     def initial_value(self, batch: int) -> NDArray[Any]:

@@ -31,16 +31,16 @@ class Element(FrozenModel):
     unit: str = Field(default="", description="SI unit such as 'rad', 'm/s'; '1' when dimensionless, '' when unknown")
     quantity: Quantity | None = Field(
         default=None,
-        description="Of an action: the command ('relative joint position': added to the present one; 'raw': the "
+        description="For an action, the command ('relative joint position': added to the present one; 'raw': the "
         "network's own numbers). A twist is a linear and an angular velocity",
     )
     joint: str = Field(default="", description="Joint, by its name in the robot's description (URDF)")
-    axis: Axis = Field(default="", description="Of a vector or a quaternion: its part")
+    axis: Axis = Field(default="", description="Part of a vector or a quaternion")
     frame: str = Field(
         default="", description="Frame that a position, direction, velocity or quaternion is expressed in"
     )
     scale: float | None = Field(default=None, description="The quantity in SI units is element * scale + offset")
-    offset: float | None = Field(default=None, description="In SI units; a clip is the space's low and high")
+    offset: float | None = Field(default=None, description="In SI units. A clip is given by the space's low and high")
 
     @model_serializer(mode="wrap")
     def _without_unknown(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:

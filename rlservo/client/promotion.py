@@ -152,8 +152,8 @@ class Promotion:
         name, version, policy = self.terms.policy, self.terms.version, self._served()
         if version not in (versions := policy.get("versions", ())):
             raise UsageError(
-                f"policy '{name}' has no version {version}: expected one of {', '.join(versions) or 'none'}; "
-                f"'rlservo policy load {name} {version}' loads one from the server's repository"
+                f"policy '{name}' has no version {version}: expected one of {', '.join(versions) or 'none'}; 'rlservo "
+                f"policy load {name} {version}' loads one from the server's repository"
             )
         if policy["version"] == version:
             raise UsageError(f"version {version} of policy '{name}' is already in production")

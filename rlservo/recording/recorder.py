@@ -68,9 +68,8 @@ class Recorder(Closeable):
         """
         if max_file_bytes < MIB or max_file_s <= 0 or max_folder_bytes < 2 * max_file_bytes:
             raise UsageError(
-                f"max_file_bytes is {max_file_bytes}, max_file_s {max_file_s:g}, max_folder_bytes "
-                f"{max_folder_bytes}: expected "
-                f"files of at least {MIB} bytes and more than 0 s, and room for two of them in the folder"
+                f"max_file_bytes is {max_file_bytes}, max_file_s {max_file_s:g}, max_folder_bytes {max_folder_bytes}: "
+                f"expected files of at least {MIB} bytes and more than 0 s, and room for two of them in the folder"
             )
         self.path = Path(path)
         self._wait = wait

@@ -64,8 +64,8 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
             progress(f"{target}/{file}")
             if not storage.create(f"{bundle.contract.name}/{bundle.contract.version}/{file}", copy):
                 raise ConflictError(
-                    f"{target}/{file} holds another file than {bundle.path / file}: the version is being published by "
-                    "another command, or was left unfinished; publish it as another one (--version next)"
+                    f"{target}/{file} holds a different file from {bundle.path / file}: the version is being "
+                    "published by another command, or was left unfinished; publish it as another one (--version next)"
                 )
     for attempt in range(ATTEMPTS):
         if storage.create(INDEX, content, tag):
@@ -119,8 +119,8 @@ def _with(index: Index, bundle: Bundle, target: str) -> bytes:
     if there := index.hash_of(bundle):
         which = "this very bundle" if there == bundle.digest else "another bundle"
         raise ConflictError(
-            f"{target} already exists ({which}): versions are never overwritten; publish it as another "
-            "one (--version next)"
+            f"{target} already exists ({which}): versions are never overwritten; publish it as another one (--version "
+            "next)"
         )
     name, version = bundle.contract.name, bundle.contract.version
     versions = {**index.policies.get(name, {}), version: bundle.digest}

@@ -68,9 +68,8 @@ class Pipelines:
             env_to_module, module_to_env = copy.deepcopy(pipelines, {id(space): space for space in spaces})
         except Exception as error:  # the user's own connectors may hold anything
             raise UnsupportedError(
-                f"the connectors cannot be copied ({first_line(error)}), so a rollout cannot be repeated "
-                "with them: keep "
-                "only data in them"
+                f"the connectors cannot be copied ({first_line(error)}), so a rollout cannot be repeated with them: "
+                "keep only data in them"
             ) from error
         for pipeline in (env_to_module, module_to_env):
             called: list[Any] = [

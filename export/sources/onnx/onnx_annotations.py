@@ -194,9 +194,8 @@ def _mjlab(place: str, metadata: Mapping[str, str], size: int, joint_order: Sequ
         )
     if robot and len(joints) != size:
         raise CheckpointError(
-            f"{place}: joint_names has {len(robot)} joints, but the action has {size} elements: "
-            "--joint-order names those "
-            "that the action moves, in its order"
+            f"{place}: joint_names has {len(robot)} joints, but the action has {size} elements: --joint-order names "
+            "those that the action moves, in its order"
         )
     clause = metadata.get("action_term") or metadata.get("action_type") or ""
     moved: dict[str, Any] = {}
@@ -350,8 +349,8 @@ def _policy_package(file: Path, manifest: Mapping[str, Any]) -> Annotation:
             [f"the runner {kind}"] if not around else [str(one.get("type") or one.get("class_path")) for one in around]
         )
         raise UnsupportedError(
-            f"{file}: {', '.join(what)} is not in the graph, which would act differently without it: export the "
-            "model with it inside, with one action per step"
+            f"{file}: {', '.join(what)} is not in the graph, which would act differently without it: export the model "
+            "with it inside, with one action per step"
         )
     robots = (manifest.get("hardware") or {}).get("robots") or [{}]
     state, action = robots[0].get("state") or {}, robots[0].get("action") or {}

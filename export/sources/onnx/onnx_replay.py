@@ -76,9 +76,8 @@ def golden_sets(file: Path, session: Any) -> int:
         for one, ours, theirs in zip(sides[1], found, wanted, strict=True):
             if ours.shape != theirs.shape or not np.allclose(ours, theirs, 1e-4, 1e-5):
                 raise CheckpointError(
-                    f"{folder.name} beside {file} has '{one.name}' {theirs.ravel()[:3].tolist()} ..., but "
-                    "onnxruntime gives "
-                    f"{ours.ravel()[:3].tolist()} ...: they do not belong together"
+                    f"{folder.name} beside {file} has '{one.name}' {theirs.ravel()[:3].tolist()} ..., but onnxruntime "
+                    f"gives {ours.ravel()[:3].tolist()} ...: they do not belong together"
                 )
     return len(folders)
 

@@ -75,8 +75,8 @@ def describe_graph(
         twins = [one for one in inputs if one not in pairs and inputs[one].shape == outputs[name].shape]
         if name != chosen[0] and twins and name not in uses:
             raise UsageError(
-                f"{file.name}: the output '{name}' has the shape of the input '{twins[0]}': if it is that input at the "
-                f"next step, give --output {name}={twins[0]}, otherwise --output {name}=none"
+                f"{file.name}: the output '{name}' has the shape of the input '{twins[0]}': if it is that input at "
+                f"the next step, give --output {name}={twins[0]}, otherwise --output {name}=none"
             )
     read = _inputs_of(graph, [chosen[0], *pairs.values()])
     used = {

@@ -189,7 +189,7 @@ def test_what_rounding_explains_is_allowed_and_counted(tmp_path: Path) -> None:
     [
         (("Det", ["square"], {}), "the operator Det of the policy's graph cannot be compiled to C"),
         (("LSTM", ["steps", some(1, 12, 6), some(1, 12, 3)], {"direction": "reverse"}), "the operator LSTM .* forward"),
-        (("GRU", ["steps", some(1, 9, 6), some(1, 9, 3)], {}), "the operator GRU .* other gates than torch's"),
+        (("GRU", ["steps", some(1, 9, 6), some(1, 9, 3)], {}), "the operator GRU .* gates other than torch's"),
         (("Max", [X, X, X], {}), "the operator Max .*: of 3 operands"),
         (("Hardmax", [X], {}), "the operator Hardmax"),
     ],

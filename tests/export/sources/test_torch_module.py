@@ -262,7 +262,7 @@ def test_a_module_whose_copy_is_another_is_refused(tmp_path: Path, notices: list
     module = Forgetful()
     rlservo.export_policy(module, SEEN, ARM, tmp_path / "out", name="x", notify=notices.append)
     module.gain = -2.0
-    with pytest.raises(UnsupportedError, match="has another 'gain' than itself"):
+    with pytest.raises(UnsupportedError, match="has a different 'gain'"):
         rlservo.export_policy(module, SEEN, ARM, tmp_path / "out", name="x", notify=notices.append)
 
 

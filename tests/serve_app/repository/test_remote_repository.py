@@ -130,7 +130,7 @@ def test_versions_are_immutable_and_the_next_number_is_found(made: Path, storage
     storage.change("DELETE", INDEX)  # as if left half-way: no server sees it, and its number is not free
     assert next_version(storage.uri, "ur5") == "2"
     with pytest.raises(
-        ConflictError, match=r"ur5/1/SHA256SUMS holds another file than .* published by another command"
+        ConflictError, match=r"ur5/1/SHA256SUMS holds a different file from .* published by another command"
     ):
         publish(other, storage.uri)
     put(made, storage.uri, "1")  # the same bundle continues where it stopped
@@ -353,7 +353,7 @@ def test_hostile_names_of_files_are_refused(
 
 UNFINISHED: dict[str, tuple[str, bytes | None, type[RlservoError], str]] = {
     "swallowed": ("/1/SHA256SUMS", None, UnavailableError, r"/ur5/1/SHA256SUMS is not there after it was written$"),
-    "changed": ("/1/policy.onnx", b"another", ConflictError, r"/ur5/1/policy\.onnx holds another file than "),
+    "changed": ("/1/policy.onnx", b"another", ConflictError, r"/ur5/1/policy\.onnx holds a different file from "),
     "index swallowed": ("/index.json", None, UnavailableError, r"/index\.json is not there after it was written$"),
     "index changed": ("/index.json", b"{", BundleError, r"/index\.json is not an index of versions"),
 }
