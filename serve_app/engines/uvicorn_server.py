@@ -462,5 +462,5 @@ def _raise_descriptor_limit() -> None:
         raise UsageError(f"this process may open {hard} files, a server needs {FEWEST_DESCRIPTORS}: raise 'ulimit -n'")
     if hard != resource.RLIM_INFINITY and hard < DESCRIPTORS:
         logger.warning(
-            "this process may open %d files: about %d connections at once fit, further ones wait", hard, hard - 64
+            "this process may open %d files: it takes about %d connections at once, others wait", hard, hard - 64
         )
