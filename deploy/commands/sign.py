@@ -26,7 +26,9 @@ def sign(
     ] = None,
     version: Version = None,
 ) -> None:
-    """Sign a bundle for `rlservo serve --require-signature`: OpenSSF Model Signing, in model.sig.
+    """Sign a bundle with OpenSSF Model Signing.
+
+    The signature, model.sig beside the bundle's files, is for `rlservo serve --require-signature`.
 
     Example: `rlservo sign policies/ur5 --key team.key`
     """

@@ -334,7 +334,7 @@ def test_two_learners_do_not_share_a_folder_or_an_alias(cell: Cell) -> None:
 
 def test_a_folder_of_something_else_stays_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "thesis.pdf").touch()
-    with pytest.raises(UsageError, match=r"holds thesis\.pdf: expected a new folder, or that of a run"):
+    with pytest.raises(UsageError, match=r"holds thesis\.pdf: expected a new folder, or the folder of a run"):
         RunFolder(tmp_path, {}, None)
     assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.pdf"]
     with RunFolder(tmp_path / "run", {"policy": "a"}, "def reward(): ...") as run:

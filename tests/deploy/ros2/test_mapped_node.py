@@ -148,7 +148,7 @@ def test_node_holds_for_a_slow_and_for_a_lost_server_and_goes_on(ros: Ros, bundl
         ros.rlservo(*words, "--mapping", mapping(bundle / "served.yaml"))
         until_state(ros, "running", act, "served")
         app.delay_s = MAX_AGE_S + 0.4
-        until_state(ros, "holding: the action came", act, "served")
+        until_state(ros, "holding: the action took", act, "served")
         before = len(ros.ask("since", topic=commands, time_s=0.0))
         late = int(ros.heartbeat("served")["late"])
         ros.wait_until(lambda: (act(), int(ros.heartbeat("served")["late"]) > late + 2)[1])

@@ -397,7 +397,7 @@ def test_outputs_whose_names_tell_nothing_are_asked_for_one_by_one(tmp_path: Pat
     with pytest.raises(UsageError, match="has the outputs mu, new_hidden: --output NAME=action says which"):
         export(given, tmp_path / "out")
     with pytest.raises(
-        UsageError, match=r"'new_hidden' has the shape of the input .*--output new_hidden=obs, else --out"
+        UsageError, match=r"'new_hidden' has the shape of the input .*--output new_hidden=obs, otherwise --out"
     ):
         export(given, tmp_path / "out", outputs={"mu": "action"})
     result = export(given, tmp_path / "out", outputs={"mu": "action", "new_hidden": "hidden"})
