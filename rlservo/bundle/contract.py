@@ -17,6 +17,11 @@ REWARD = "reward"  # the graph's input for the last action's reward, if the poli
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
 REWARD_PATTERN = r"^([A-Za-z_][A-Za-z0-9_.]*:[A-Za-z_][A-Za-z0-9_]*)?$"
 VERSION_PATTERN = r"^([1-9][0-9]{0,8}|(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8})\.(0|[1-9][0-9]{0,8}))$"
+PATTERNS = {  # for a person
+    NAME_PATTERN: "a name of letters, digits, '.', '_' and '-', which begins with a letter or digit",
+    REWARD_PATTERN: "module:function",
+    VERSION_PATTERN: "a version such as 3 or 1.2.0",
+}
 Tolerance: TypeAlias = Annotated[float, Field(ge=0.0, le=1e-2)]
 """A larger difference is never rounding."""
 
@@ -184,7 +189,10 @@ def first_fault(error: ValidationError, *, shows_input: bool = False) -> str:
     """Return the first error in a document: `field: message`, and the input."""
     first = error.errors(include_url=False)[0]
     given = f" (given: {first['input']!r:.80})" if shows_input else ""
-    return f"{'.'.join(str(part)[:80] for part in first['loc']) or 'the document'}: {first['msg']}{given}"
+    reason = first["msg"]
+    if (pattern := first.get("ctx", {}).get("pattern")) in PATTERNS:
+        reason = f"expected {PATTERNS[pattern]}"
+    return f"{'.'.join(str(part)[:80] for part in first['loc']) or 'the document'}: {reason}{given}"
 
 
 def parse_contract(text: str, source: str) -> Contract:

@@ -37,6 +37,7 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
+from rlservo.serve_app.versions.deployment_plan import ServedConfig
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
 from servers import exchange
@@ -384,6 +385,10 @@ def test_serve_takes_versions_from_a_file_and_options_win(tmp_path: Path) -> Non
     for wrong in ("ur5", "ur5:production", "=3"):
         with pytest.raises(UsageError, match="expected something like"):
             served_config(None, None, [wrong], None, None)
+    with pytest.raises(
+        UsageError, match=r"policies\.ur5\.versions\.0: expected a version such as 3 or 1\.2\.0 \(given"
+    ):
+        ServedConfig.parse(served_config(None, ["ur5=abc"], None, None, None))
     with pytest.raises(UsageError, match=r"^--versions 'ur5=1,ur5=2': expected one policy, such as ur5=3,4"):
         served_config(None, ["ur5=1,ur5=2"], None, None, None)
     for given in ((["p=1", "p=2"], None, None, None), (None, None, ["p:1=0.1", "p:2=0.1"], None)):
