@@ -15,7 +15,9 @@ from collections import defaultdict
 from typing import Any
 
 import rclpy
+from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 KEPT = 5000  # messages of a topic
@@ -54,6 +56,8 @@ def main() -> None:
     messages: dict[str, list[tuple[float, Any]]] = defaultdict(list)
     made: dict[str, Any] = {}
     arrived: dict[str, int] = {}
+    goals: list[dict[str, Any]] = []
+    clients: dict[str, Any] = {}
 
     def take(topic: str, message: Any) -> None:
         messages[topic].append((time.time(), message))
@@ -107,6 +111,78 @@ def main() -> None:
             time.sleep(0.01)
         return {"sent_s": sent_s, **to_plain(future.result())}
 
+    def wait_for(future: Any, what: str) -> Any:
+        limit = time.monotonic() + 60.0
+        while not future.done():
+            assert time.monotonic() < limit, f"{what} does not answer"
+            time.sleep(0.01)
+        return future.result()
+
+    def send_goal(action: str, kind: str, values: dict[str, Any]) -> int | None:
+        """Send a goal and return its number, None if it is rejected."""
+        made = interface(kind)
+        if action not in clients:
+            clients[action] = ActionClient(node, made, action)
+        assert clients[action].wait_for_server(60.0), f"no action {action}"
+        goal: dict[str, Any] = {"feedback": [], "ended_s": None}
+        sent = clients[action].send_goal_async(
+            fill(made.Goal(), values), lambda message: goal["feedback"].append((time.time(), message.feedback))
+        )
+        goal["handle"] = wait_for(sent, action)
+        if not goal["handle"].accepted:
+            return None
+        goal["result"] = goal["handle"].get_result_async()
+        goal["result"].add_done_callback(lambda _: goal.update(ended_s=time.time()))
+        goals.append(goal)
+        return len(goals) - 1
+
+    def goal(number: int) -> Any:
+        """Return a goal's status, and its result once it has one."""
+        one = goals[number]
+        known = {"status": one["handle"].status, "ended_s": one["ended_s"], "count": len(one["feedback"])}
+        if one["result"].done():
+            known |= {"status": one["result"].result().status, "result": to_plain(one["result"].result().result)}
+        return known | {"feedback": to_plain(one["feedback"][-1][1]) if one["feedback"] else None}
+
+    def cancel(number: int) -> Any:
+        """Ask for a goal's end; return when, and how many goals will end."""
+        sent_s = time.time()
+        answer = wait_for(goals[number]["handle"].cancel_goal_async(), "cancel")
+        return {"sent_s": sent_s, "count": len(answer.goals_canceling)}
+
+    def request(of: str, what: str, **fields: Any) -> Any:
+        """Call a parameter service of a node."""
+        kind = interface(f"rcl_interfaces/srv/{what}Parameters")
+        client = node.create_client(kind, f"{of}/{what.lower()}_parameters")
+        assert client.wait_for_service(60.0)
+        return to_plain(wait_for(client.call_async(kind.Request(**fields)), of))
+
+    def parameter(of: str, which: str) -> Any:
+        """Return a parameter's value and descriptor."""
+        value, descriptor = request(of, "Get", names=[which]), request(of, "Describe", names=[which])
+        return {**value["values"][0], **descriptor["descriptors"][0]}
+
+    def set_parameter(of: str, which: str, value: Any) -> Any:
+        return request(of, "Set", parameters=[Parameter(which, value=value).to_parameter_msg()])["results"][0]
+
+    def offered(topic: str, what: str) -> Any:
+        """Return the quality of service of a topic's publishers or subscriptions."""
+        found = getattr(node, f"get_{what}_info_by_topic")(topic)
+        return [(one.node_name, one.qos_profile.reliability.name) for one in found]
+
+    def send_frames(topic: str, parent: str, frames: dict[str, tuple[float, float, float]]) -> None:
+        """Publish static frames as x, y [m] and yaw [rad] in their parent, from a publisher of their own."""
+        message = interface("tf2_msgs/msg/TFMessage")()
+        for name, (x, y, yaw) in frames.items():
+            one = interface("geometry_msgs/msg/TransformStamped")()
+            one.header.frame_id, one.child_frame_id = parent, name
+            one.transform.translation.x, one.transform.translation.y = x, y
+            one.transform.rotation.z, one.transform.rotation.w = math.sin(yaw / 2.0), math.cos(yaw / 2.0)
+            message.transforms.append(one)
+        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        made[f"{topic} {parent}"] = node.create_publisher(type(message), topic, kept)
+        made[f"{topic} {parent}"].publish(message)
+
     def withdraw(topic: str) -> None:
         node.destroy_publisher(made.pop(topic))
 
@@ -118,7 +194,8 @@ def main() -> None:
 
     known = {
         "subscribe": subscribe, "publish": publish, "call": call, "since": since, "publishers": publishers,
-        "withdraw": withdraw,
+        "withdraw": withdraw, "send_frames": send_frames, "send_goal": send_goal, "goal": goal, "cancel": cancel,
+        "parameter": parameter, "set_parameter": set_parameter, "offered": offered,
         "lead": lead, "arrived": lambda topic: arrived[topic],
     }  # fmt: skip
     print(json.dumps("ready"), flush=True)

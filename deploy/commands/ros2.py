@@ -59,44 +59,58 @@ def ros2(
 ) -> None:
     """Drive a robot as a ROS 2 node until Ctrl-C.
 
-    A policy of a built-in environment drives its robot to each pose on ~/target. Any other policy's observation and
-    action elements are mapped to message fields, by name or by --mapping. Services: ~/start, ~/hold, ~/stop, ~/version;
-    heartbeat: /diagnostics.
+    A policy of a built-in environment drives its robot to each pose on ~/target, or goal of ~/navigate_to_pose. Any
+    other policy's observation and action elements are mapped to message fields, by name or by --mapping. Services:
+    ~/start, ~/hold, ~/stop, ~/version; heartbeat: /diagnostics. Each option but --name and --mapping is a parameter of
+    the node as well; the option wins.
 
     Example: `rlservo ros2 --bundle policies/ur_positioning --env-arg ur_model=ur5e`
     """
-    if (url is None) == (bundle is None):
-        raise UsageError("expected either --url (a server) or --bundle (in process)")
+    given = {option: value for option, value in locals().items() if option not in ("mapping", "name", "ros_args")}
     terminal.show_log()
     _pass_ros_arguments(ros_args or [], mapping)
     with needs_extra("sim", "mujoco", "gymnasium"):
         from rlservo.deploy.ros2.node import PolicyNode, drive_elements, drive_environment, real_environment
+        from rlservo.deploy.ros2.parameters import with_parameters
         from rlservo.robots.arm_interface import RobotError
-    if record is not None:
-        require("record", "mcap", "orjson")
+        from rlservo.robots.ros2.rclpy_link import RclpyLink
     with ExitStack() as cleanup:
         cleanup.enter_context(terminal.ends_like_ctrl_c())  # until the robot is connected, which may take a minute
-        opened = acting_policy(url, policy, bundle, version, transport, deadline_ms, False, None)
-        acting: Any = cleanup.enter_context(opened)
-        acting = with_fallback(acting, fallback)
-        if record is not None:
-            from rlservo.recording.start import record_policy
-
-            acting = record_policy(acting, record)
-            cleanup.callback(acting.end)
         try:
-            node = PolicyNode(acting, name, autostart=autostart)
+            link = RclpyLink(name, is_unique=True)
+            cleanup.callback(link.close)
+            cleanup.enter_context(link.has_log("rlservo"))
+            chosen = with_parameters(link, ros2, given)
+            acting = cleanup.enter_context(_opened(chosen))
+            if chosen["record"] is not None:
+                from rlservo.recording.start import record_policy
+
+                acting = record_policy(acting, chosen["record"])
+                cleanup.callback(acting.end)
+            node = PolicyNode(acting, link, autostart=chosen["autostart"])
             cleanup.callback(node.close)
             node.on_connected = lambda: cleanup.enter_context(terminal.ctrl_c_sets(node.stop))
             terminal.note(f"node /{name}: policy {acting.contract.name} {acting.contract.version}; Ctrl-C ends it")
             ours = real_environment(acting.contract)
-            if ours is not None and not node.parameters():
-                arguments = ours[1] | parse_env_arguments(env_arg or []) | {"robot": robot, "confirm": False}
-                drive_environment(node, ours[0], arguments, unproven=unproven)
+            if ours is not None and not node.mapped():
+                arguments = ours[1] | parse_env_arguments(chosen["env_arg"] or [])
+                arguments |= {"robot": chosen["robot"], "confirm": False}
+                drive_environment(node, ours[0], arguments, unproven=chosen["unproven"])
             else:
-                drive_elements(node, rate_hz=rate, max_age_s=max_age)
+                drive_elements(node, rate_hz=chosen["rate"], max_age_s=chosen["max_age"])
         except RobotError as error:
             raise UsageError(str(error)) from error
+
+
+def _opened(chosen: dict[str, Any]) -> Any:
+    url, bundle, record = chosen["url"], chosen["bundle"], chosen["record"]
+    if (url is None) == (bundle is None):
+        raise UsageError("expected either --url (a server) or --bundle (in process)")
+    if record is not None:
+        require("record", "mcap", "orjson")
+    transport, deadline_ms = chosen["transport"], chosen["deadline_ms"]
+    opened = acting_policy(url, chosen["policy"], bundle, chosen["version"], transport, deadline_ms, False, None)
+    return with_fallback(opened, chosen["fallback"])
 
 
 def ros2_sim(

@@ -46,6 +46,7 @@ PARTS: dict[str, Quantity] = {
 """Fields of ROS's messages with parts x, y, z (w); `linear` and `angular` are those of a twist."""
 CONTROLLER = re.compile(rf".*({'|'.join(JOINT_FIELDS)})_controller/commands")
 RELATIVE = "relative joint position"
+VELOCITIES = ("joint velocity", "linear velocity", "angular velocity")
 COMMANDED, READ = "double|float", r"double|float|u?int\d+|boolean"  # types of numbers, as messages name them
 
 
@@ -140,7 +141,7 @@ class Place:
 
 def places(contract: Contract, mapped: Mapping[str, str]) -> tuple[list[Place], list[Place]]:
     """Return where the observation's and the action's elements are, by their names or as `mapped` says; `stop.NAME`
-    is the number of an action's element that stops it, 0 for a Twist.
+    is the number of an action's element that stops it, 0 for velocities.
 
     A position, velocity or effort of a joint, and `X_position`, `X_velocity` and `X_effort`, are joint X of
     /joint_states, others `~/observation/NAME`; actions are a Float64MultiArray on `~/action`. Raises UsageError for
@@ -166,6 +167,10 @@ def places(contract: Contract, mapped: Mapping[str, str]) -> tuple[list[Place], 
     unknown = [name for name in mapped if name not in known]
     if unknown:
         raise UsageError(f"parameter {unknown[0]!r} maps no element: expected one of {', '.join(known)}")
+    for element, place in zip(contract.action_space.elements, acted, strict=False):
+        if element.quantity in VELOCITIES:  # the action that is no velocity, as a message has it
+            still = -(element.offset or 0.0) / (element.scale or 1.0)
+            acted[acted.index(place)] = replace(place, stop=still * place.factor + place.offset + 0.0)
     acted = [_with_stop(place, mapped.get(f"stop.{place.element}")) for place in acted]
     for place in (*observed, *acted):
         if (kind := kinds.setdefault(place.topic, place.kind)) != place.kind:

@@ -24,6 +24,8 @@ from rlservo.deploy.ros2.mapped_elements import (
     check_conventions,
     places,
 )
+from rlservo.deploy.ros2.parameters import MAPPED
+from rlservo.deploy.ros2.targets import GivenTarget, Targets
 from rlservo.drive.driven_episode import report_step
 from rlservo.drive.environment_fit import check_fit
 from rlservo.drive.make_environment import make_env
@@ -35,10 +37,13 @@ from rlservo.robots.arm_states import Change, ControlState
 from rlservo.robots.operator_terminal import Operator
 from rlservo.robots.ros2.link import take_command
 from rlservo.robots.ros2.rclpy_link import RclpyLink
-from rlservo.robots.ros2.ros_messages import DIAGNOSTICS, POSE_STAMPED, stamp
+from rlservo.robots.ros2.ros_messages import DIAGNOSTICS, stamp
 from rlservo.robots.ur.parameters import JOINTS
 
 HEARTBEAT_S = 0.5
+STANDS = 0.01  # [rad/s], [m/s]
+BRAKING_S = 3.0  # from full speed, and a slow machine
+STOPPED = "the robot has stopped; call the start service first"
 OK, WARN, ERROR = b"\x00", b"\x01", b"\x02"  # DiagnosticStatus' levels
 LEVELS = {
     **dict.fromkeys(("holding", "hold", "blocked", "waiting", "refused", "human"), WARN),
@@ -78,12 +83,11 @@ class Wanted(str, Enum):
 class PolicyNode:
     """A node `rlservo`, driven until `stop` is set. Its services answer at once, the loop follows."""
 
-    def __init__(self, policy: ActingPolicy, name: str, *, autostart: bool) -> None:
-        """Join the graph. Raises RobotError without rclpy."""
-        self.policy = policy
+    def __init__(self, policy: ActingPolicy, link: RclpyLink, *, autostart: bool) -> None:
+        """Offer the services on a node of the graph."""
+        self.policy, self.link = policy, link
         self.stop = threading.Event()
         self.on_connected: Callable[[], object] = lambda: None  # before, nothing looks at `stop`
-        self.link = RclpyLink(name, is_unique=True)
         self.state, self.why = "waiting", ""
         self.counts: dict[str, int] = {"decisions": 0, "episodes": 0, "successes": 0, "held": 0, "late": 0}
         self.wanted = Wanted.RUN if autostart else Wanted.STOP
@@ -97,13 +101,9 @@ class PolicyNode:
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
         self._thread.start()
 
-    def parameters(self) -> dict[str, str]:
+    def mapped(self) -> dict[str, str]:
         """Return the parameters that map elements: `observation.NAME`, `action.NAME` and `stop.NAME`."""
-        found: dict[str, str] = {}
-        for side in ("observation", "action", "stop"):
-            for name, parameter in self.link.node.get_parameters_by_prefix(side).items():
-                found[f"{side}.{name}"] = str(parameter.value)
-        return found
+        return {name: str(value) for name, value in self.link.parameters().items() if name.startswith(MAPPED)}
 
     def enter(self, state: str, why: str = "") -> None:
         """Change the state: a line in the log where more than a number of it is new, and the next heartbeat."""
@@ -112,10 +112,9 @@ class PolicyNode:
         self.state, self.why = state, why
 
     def close(self) -> None:
-        """Leave the graph."""
+        """End the heartbeat."""
         self._is_closed.set()
         self._thread.join()
-        self.link.close()
 
     def _setter(self, word: Wanted) -> Callable[[], tuple[bool, str]]:
         def answer() -> tuple[bool, str]:
@@ -146,7 +145,7 @@ def drive_elements(node: PolicyNode, *, rate_hz: float | None, max_age_s: float 
     rate_hz = rate_hz or contract.control_rate_hz
     if rate_hz is None:
         raise UsageError(f"policy {contract.name!r} states no control rate: give --rate")
-    observed, acted = places(contract, node.parameters())
+    observed, acted = places(contract, node.mapped())
     for side, numbers in ((observed, READ), (acted, COMMANDED)):
         for place in side:
             place.check(numbers)
@@ -201,23 +200,6 @@ def _drive_elements(
         time.sleep(max(0.0, due - time.monotonic()))
 
 
-class _Target:
-    """The newest target, and the numbers of those that were begun and that are over."""
-
-    def __init__(self, frame: str) -> None:
-        self._frame = frame
-        self.pose: Any = None
-        self.number = self.begun = self.done = 0
-
-    def take(self, message: Any) -> None:
-        frame = message.header.frame_id
-        if frame and frame != self._frame:
-            log.warning("a target in frame %r was ignored: expected %r", frame, self._frame)
-            return
-        self.pose = message.pose.position
-        self.number += 1
-
-
 def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str, Any], *, unproven: bool) -> None:
     """Drive one of our robots to each target on `~/target` until the node is stopped. Raises UsageError, RobotError."""
     real_id, option, frame = REAL[trained_in]
@@ -228,41 +210,77 @@ def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str,
         if not unproven:
             check_proven(node.policy.contract, env)
         robot: Any = env.unwrapped
-        target = _Target(robot.simulation.frame if frame == "odom" else frame)
-        node.link.subscribe("~/target", POSE_STAMPED, target.take)
+        simulation = robot.simulation
+        targets = Targets(node.link, simulation.frame if frame == "odom" else frame, partial(_refusal, node))
         for word, to_person in (("take_over", True), ("hand_back", False)):
-            node.link.serve(f"~/{word}", partial(_lead, robot.simulation.operator, to_person=to_person))
-        robot.simulation.states.on_change = partial(_say_hold, node)
-        robot.simulation.is_called_off = lambda: node.stop.is_set() or node.wanted is not Wanted.RUN
-        starts = node.starts
-        while not node.stop.is_set():
-            if node.state != "fault":
-                starts = node.starts
-            elif node.starts > starts:
-                robot.simulation.operator.allow_restart()
-                node.enter("waiting", "started again")
-                robot.simulation.stopped_by = None
-            else:
-                if target.number != target.done:
-                    log.warning("node: a target was ignored: the robot has stopped; call the start service first")
-                target.done = target.number
-                robot.simulation.advance()
-                continue
-            if node.wanted is not Wanted.RUN:
-                node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
-            elif robot.simulation.is_led:
-                node.enter(robot.simulation.states.state.value)
-            elif target.number == target.done:
-                if robot.simulation.stopped_by is not None:  # while it stood
-                    node.enter("fault", robot.simulation.stopped_by)
-                elif node.state not in ("arrived", "failed", "refused"):
-                    node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
-            else:
-                _drive_to(node, env, option, target)
-                continue
-            robot.simulation.advance()  # the model stays where the robot is
+            node.link.serve(f"~/{word}", partial(_lead, simulation.operator, to_person=to_person))
+        simulation.states.on_change = partial(_say_hold, node)
+        simulation.is_called_off = lambda: (
+            node.stop.is_set() or node.wanted is not Wanted.RUN or targets.newest.is_cancelled
+        )
+        try:
+            _drive_to_targets(node, env, option, targets)
+        finally:
+            if targets.is_due and targets.newest.goal is not None:
+                _brake(simulation)
+            targets.close()
     finally:
         env.close()
+
+
+def _drive_to_targets(node: PolicyNode, env: Any, option: str, targets: Targets) -> None:
+    simulation = env.unwrapped.simulation
+    starts = node.starts
+    while not node.stop.is_set():
+        target = targets.newest
+        if node.state != "fault":
+            starts = node.starts
+        elif node.starts > starts:
+            simulation.operator.allow_restart()
+            node.enter("waiting", "started again")
+            simulation.stopped_by = None
+        else:
+            if targets.is_due:
+                log.warning("node: a target was ignored: %s", STOPPED)
+                targets.end(target, "abort", STOPPED)
+            simulation.advance()
+            continue
+        if targets.is_due and target.is_cancelled:
+            _brake(simulation)
+            targets.end(target, "canceled")
+            if node.wanted is Wanted.RUN and not simulation.is_led:
+                node.enter("waiting", "the goal was cancelled")
+        elif node.wanted is not Wanted.RUN:
+            node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
+            if node.wanted is Wanted.STOP and target.goal is not None and targets.is_due:
+                _brake(simulation)
+                targets.end(target, "abort", "the stop service was called")
+        elif simulation.is_led:
+            node.enter(simulation.states.state.value)
+        elif not targets.is_due:
+            if simulation.stopped_by is not None:  # while it stood
+                node.enter("fault", simulation.stopped_by)
+            elif node.state not in ("arrived", "failed", "refused"):
+                node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
+        else:
+            _drive_to(node, env, option, targets, target)
+            continue
+        simulation.advance()  # the model stays where the robot is
+
+
+def _refusal(node: PolicyNode) -> str:
+    """Return why no goal can be accepted now; empty if one can."""
+    if node.wanted is not Wanted.RUN:
+        return "the node is not started: call the start service first"
+    return STOPPED if node.state == "fault" else ""
+
+
+def _brake(simulation: Any) -> None:
+    """Hold, and wait until the robot stands: a client may touch it once it has its result."""
+    simulation.hold()
+    until_s = time.monotonic() + BRAKING_S
+    while np.abs(simulation.data.qvel).max() > STANDS and time.monotonic() < until_s:
+        simulation.advance()
 
 
 def _say_hold(node: PolicyNode, change: Change) -> None:
@@ -278,34 +296,36 @@ def _lead(operator: Operator, *, to_person: bool) -> tuple[bool, str]:
     return True, "the state is human once the robot may be led" if to_person else "given back"
 
 
-def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
-    """Drive to the newest target, which remains due if the drive is interrupted.
+def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target: GivenTarget) -> None:
+    """Drive to a target, which remains due if the drive is interrupted.
 
     As in a rollout an arm first returns to its start: that is where its policy was trained and proven. After an
     interruption it goes on from its present pose.
     """
     robot, policy = env.unwrapped, node.policy
-    number, position = target.number, target.pose
-    goal = [position.x, position.y, position.z] if option == "ee_target_pose" else [position.x, position.y]
+    number, is_arm = target.number, option == "ee_target_pose"
+    goal = [*target.position[: 3 if is_arm else 2]]
     if not np.isfinite(goal).all():  # an arm would return to its start before it is noticed
         node.enter("refused", f"the target is {', '.join(f'{value:g}' for value in goal)} m: expected finite numbers")
-        target.done = number
+        targets.end(target, "abort", node.why)
         return
-    goal += [0.0] * ((6 if option == "ee_target_pose" else 3) - len(goal))
-    if target.begun != number:
+    goal += [0.0] * ((6 if is_arm else 3) - len(goal))
+    if targets.begun != number:
         node.enter("starting")
-    options = {**robot.reset_options(start="here" if target.begun == number else "own"), option: goal}
+    options = {**robot.reset_options(start="here" if targets.begun == number else "own"), option: goal}
     try:
         observation, _ = env.reset(options=options)
     except ValueError as error:
         if not robot.simulation.is_called_off():
             node.enter("fault" if isinstance(error, RobotError) else "refused", str(error))
-            target.done = number  # a robot must not move by itself: a new target is needed, after a fault a start too
+            targets.end(
+                target, "abort", str(error)
+            )  # a robot must not move by itself: a new target is needed, after a fault a start too
         return
-    target.begun = number
+    targets.begun = number
     policy.reset()
     is_first = True
-    while not node.stop.is_set() and node.wanted is Wanted.RUN and target.number == number:
+    while not robot.simulation.is_called_off() and targets.newest is target:
         try:
             action = policy.act(observation)
         except RlservoError as error:
@@ -320,6 +340,7 @@ def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
         report_step(policy, step)
         observation, _, terminated, truncated, info = step
         node.counts["decisions"] += 1
+        targets.tell(target, *_whereabouts(robot, is_arm))
         state, blocked = info["robot"]["state"], info["robot"].get("blocked", "")
         if terminated or truncated:
             robot.simulation.hold()
@@ -332,10 +353,22 @@ def _drive_to(node: PolicyNode, env: Any, option: str, target: _Target) -> None:
                 node.enter("arrived", info["final_status"])
             else:
                 node.enter("failed", info["final_status"] + (f", blocked: {blocked}" if blocked else ""))
-            target.done = number
+            if target.goal is not None:
+                _brake(robot.simulation)
+            targets.end(target, "succeed" if node.state == "arrived" else "abort", f"{node.state}: {node.why}")
             return
         if state in ("run", "blend_in"):
             node.enter("blocked" if blocked else "running", blocked)
         else:
             node.enter(state)
     robot.simulation.hold()
+
+
+def _whereabouts(robot: Any, is_arm: bool) -> tuple[tuple[float, float, float], float]:
+    """Return the robot's place in the frame of targets [m], and its distance from the target [m]."""
+    away = robot.target_position() - robot.robot_position()
+    if is_arm:
+        x, y, z = robot.simulation.tool_position.tolist()
+        return (x, y, z), float(np.linalg.norm(away))
+    x, y, _ = robot.simulation.pose
+    return (x, y, 0.0), float(np.linalg.norm(away[:2]))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib
+import logging
 import os
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 from rlservo.robots.arm_interface import RobotError
 from rlservo.robots.ros2.link import FIRST_MESSAGES_S, Endpoint, Publish, safely, wait_until
@@ -18,6 +19,64 @@ GUARD = "rlservo_guard"  # publishes only zeros, when its own commander has fall
 SERVICE_S = 3.0  # for a service to be discovered, and to answer
 KEPT_MESSAGES = 100  # each node of a graph keeps its own static transforms
 ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, also for the processes that we start
+MOST = 1e9  # a parameter's range has two ends
+
+Outcome = Literal["succeed", "abort", "canceled"]
+
+
+class Goal:
+    """A goal of an action, which is active until `end`. Any thread may call its methods."""
+
+    def __init__(self, handle: Any, action: Any, wake: Callable[[], None]) -> None:
+        """Made by `RclpyLink.serve_action`, for rclpy's own handle."""
+        self.request: Any = handle.request
+        self._handle, self._action, self._wake = handle, action, wake
+        self._is_first = threading.Lock()  # held by the first `end`
+        self._outcome: tuple[Outcome, Mapping[str, Any]] | None = None
+        self.is_over = threading.Event()  # whether the client gets to know of the end
+
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether a client has asked for its end."""
+        return bool(self._handle.is_cancel_requested)
+
+    def tell(self, feedback: Mapping[str, Any]) -> None:
+        """Publish feedback."""
+        self._handle.publish_feedback(fill(self._action.Feedback(), feedback))
+
+    def end(self, outcome: Outcome, result: Mapping[str, Any]) -> None:
+        """End it, once; fields that the distribution's result lacks are left out. "canceled" needs `is_cancelled`."""
+        if self._is_first.acquire(blocking=False):
+            self._outcome = outcome, result
+            self._wake()
+
+    def __await__(self) -> Generator[None, None, Any]:
+        """Wait in the executor's thread until the end, and return the result."""
+        while self._outcome is None:
+            yield
+        outcome, values = self._outcome
+        self.is_over.set()
+        {"succeed": self._handle.succeed, "abort": self._handle.abort, "canceled": self._handle.canceled}[outcome]()
+        result = self._action.Result()
+        return fill(result, {name: value for name, value in values.items() if hasattr(result, name)})
+
+
+class RosLog(logging.Handler):
+    """Passes our log to ROS's, which has the terminal, /rosout and a file."""
+
+    def __init__(self, logger: Any) -> None:
+        """Take a node's logger."""
+        super().__init__()
+        self._logger = logger
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a record. rclpy wants each line of code to have one severity."""
+        if record.levelno >= logging.ERROR:
+            self._logger.error(record.getMessage())
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(record.getMessage())
+        else:
+            self._logger.info(record.getMessage())
 
 
 class RclpyLink:
@@ -73,13 +132,18 @@ class RclpyLink:
         offered = {one.qos_profile.durability for one in self.node.get_publishers_info_by_topic(topic)}
         keeps = is_kept or offered == {QoSDurabilityPolicy.TRANSIENT_LOCAL}
         qos = self._qos(is_kept=keeps, is_reliable=False, depth=KEPT_MESSAGES if is_kept else 1)
-        made = self.node.create_subscription(message_class(kind), topic, safely(on_message, topic), qos)
+        with self._overridable(topic) as options:
+            made = self.node.create_subscription(
+                message_class(kind), topic, safely(on_message, topic), qos, qos_overriding_options=options
+            )
         self._own["subscriber", made.topic_name] += 1
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
         """Publish reliably, only the newest message."""
         made = message_class(kind)
-        publisher = self.node.create_publisher(made, topic, self._qos(is_kept=is_kept, is_reliable=True))
+        qos = self._qos(is_kept=is_kept, is_reliable=True)
+        with self._overridable(topic) as options:
+            publisher = self.node.create_publisher(made, topic, qos, qos_overriding_options=options)
         self._own["publisher", publisher.topic_name] += 1
 
         def publish(values: Mapping[str, Any]) -> None:
@@ -96,6 +160,76 @@ class RclpyLink:
             return response
 
         self.node.create_service(message_class("std_srvs/srv/Trigger"), name, handle)
+
+    def serve_action(self, name: str, kind: str, refusal: Callable[[Any], str], begin: Callable[[Goal], None]) -> None:
+        """Offer an action. `refusal` returns why a goal is rejected, empty if it is accepted; `begin` must not block.
+
+        Raises RobotError if the action's package is not installed.
+        """
+        from rclpy import action  # pyright: ignore[reportMissingImports]
+
+        made = message_class(kind)
+
+        def decide(request: Any) -> Any:
+            if why := refusal(request):
+                self.node.get_logger().warning(f"a goal of {name} is rejected: {why}")
+            return action.GoalResponse.REJECT if why else action.GoalResponse.ACCEPT
+
+        async def execute(handle: Any) -> Any:
+            goal = Goal(handle, made, self._executor.wake)
+            begin(goal)
+            return await goal
+
+        action.ActionServer(
+            self.node, made, name, execute,
+            goal_callback=decide, cancel_callback=lambda _: action.CancelResponse.ACCEPT,
+        )  # fmt: skip
+
+    @contextlib.contextmanager
+    def has_log(self, name: str) -> Iterator[None]:
+        """Pass a logger of Python's to ROS's log instead of the terminal, which that one has."""
+        log, handler = logging.getLogger(name), RosLog(self.node.get_logger())
+        log.addHandler(handler)
+        log.propagate = False
+        try:
+            yield
+        finally:
+            log.propagate = True
+            log.removeHandler(handler)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the values of all parameters that were given or declared."""
+        return {name: one.value for name, one in self.node.get_parameters_by_prefix("").items()}
+
+    def declare(
+        self, name: str, kind: str, description: str, *, low: float | None = None, value: Any = None,
+        is_fixed: bool = False,
+    ) -> Any:  # fmt: skip
+        """Declare a read-only parameter, and return what was given, else `value`.
+
+        `kind` is such as DOUBLE, or empty for any; `is_fixed`: `value` counts, whatever was given. Raises RobotError
+        for a value of another kind, or below `low`.
+        """
+        descriptor = message_class("rcl_interfaces/msg/ParameterDescriptor")(
+            description=description,
+            read_only=True,
+            dynamic_typing=True,  # other types may not have no value
+        )
+        if low is not None:
+            bounds = message_class("rcl_interfaces/msg/FloatingPointRange")(from_value=low, to_value=MOST)
+            descriptor.floating_point_range = [bounds]
+        given = self.parameters().get(name)
+        if given is not None:  # declared as it came, which would let it change
+            self.node.undeclare_parameter(name)
+        expected = kind.lower().replace("_", " ") + ("" if low is None else f" of at least {low:g}")
+        problem = f"parameter {name!r} is {value if is_fixed else given!r}: expected {expected}"
+        try:
+            found = self.node.declare_parameter(name, value, descriptor, ignore_override=is_fixed)
+        except Exception as error:  # out of its range
+            raise RobotError(problem) from error
+        if kind not in ("", found.type_.name) and found.value is not None:
+            raise RobotError(problem)
+        return found.value
 
     def publishers(self, topic: str) -> list[Endpoint]:
         """Return the publishers of other nodes."""
@@ -142,6 +276,22 @@ class RclpyLink:
             else:
                 others.append(one)
         return others
+
+    @contextlib.contextmanager
+    def _overridable(self, topic: str) -> Iterator[Any]:
+        """Let parameters override the quality of service. Raises RobotError for a value that is none."""
+        from rclpy.qos import QoSPolicyKind  # pyright: ignore[reportMissingImports]
+        from rclpy.qos_overriding_options import QoSOverridingOptions  # pyright: ignore[reportMissingImports]
+
+        kinds = [QoSPolicyKind[name] for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY")]
+        try:
+            yield QoSOverridingOptions(kinds)
+        except Exception as error:  # rclpy has no common base for what a wrong value raises
+            prefix = f"qos_overrides.{self.node.resolve_topic_name(topic)}."
+            given = {name: value for name, value in self.parameters().items() if name.startswith(prefix)}
+            if not given:
+                raise
+            raise RobotError(f"{topic} does not accept the quality of service {given}: {error}") from error
 
     @staticmethod
     def _qos(*, is_kept: bool, is_reliable: bool, depth: int = 1) -> Any:

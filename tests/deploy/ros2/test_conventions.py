@@ -102,3 +102,13 @@ def test_relative_position_becomes_the_present_one_and_the_scaled_action() -> No
     observation = np.array([place.read(message) for place in observed], np.float32)
     targets = present.targets(np.array([2.0, 0.3], np.float32), observation)
     assert targets.tolist() == pytest.approx([-0.7 + 0.0625 * 2.0, 0.3], abs=1e-6)
+
+
+def test_velocities_stop_at_the_number_that_is_no_velocity() -> None:
+    speed = {"name": "v", "quantity": "joint velocity", "scale": 0.5, "offset": 0.1}
+    contract = contract_of(SEEN, [speed, joint("pan"), joint("lift", "joint effort")])
+    at = [place.stop for place in places(contract, {})[1]]
+    assert at == [pytest.approx(-0.2), None, None]  # -0.2 * 0.5 + 0.1 = 0 rad/s
+    assert [place.stop for place in places(contract, {"stop.v": "1.0", "stop.pan": "0.5"})[1]] == [1.0, 0.5, None]
+    in_si = {"action.v": "/base std_msgs/msg/Float64 data * 0.5 + 0.1"}
+    assert places(contract, in_si)[1][0].stop == pytest.approx(0.0)

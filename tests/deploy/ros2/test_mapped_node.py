@@ -308,3 +308,30 @@ def test_ros_2_finds_the_package_its_executable_and_launch_file(ros: Ros, wheel:
     given = [word for word in started.attrib["args"].split() if word.startswith("--")]
     assert given
     assert all(word in shown.stdout for word in given)
+
+
+def test_colcon_builds_the_package(ros: Ros, tmp_path: Path) -> None:
+    source = Path(__file__).parents[3] / "deploy" / "ros2"
+    shutil.copytree(source, tmp_path / "src" / "rlservo", ignore=shutil.ignore_patterns("__pycache__"))
+    prefix = PYTHON.parents[1]
+    variables = os.environ | {
+        "AMENT_PREFIX_PATH": str(prefix), "CMAKE_PREFIX_PATH": str(prefix), "HOME": str(tmp_path),
+        "PATH": f"{prefix / 'bin'}:{os.environ['PATH']}",
+    }  # fmt: skip
+    words = ["build", "--cmake-args", f"-DPython3_EXECUTABLE={PYTHON}"]
+    built = subprocess.run(
+        [prefix / "bin" / "colcon", *words], cwd=tmp_path, env=variables, capture_output=True, text=True, timeout=300
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    installed = tmp_path / "install" / "rlservo"
+    assert (installed / "share/rlservo/launch/policy.launch.xml").exists()
+    assert (installed / "share/ament_index/resource_index/packages/rlservo").exists()
+    there = tmp_path / "bin"  # of an active environment
+    there.mkdir()
+    (there / "rlservo").write_text('#!/bin/sh\necho "$@"\n')
+    (there / "rlservo").chmod(0o755)
+    said = subprocess.run(
+        [installed / "lib/rlservo/policy", "--bundle", "x"],
+        env=os.environ | {"PATH": f"{there}:{os.environ['PATH']}"}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert said.stdout == "ros2 --bundle x\n", said.stderr

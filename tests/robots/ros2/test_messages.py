@@ -232,7 +232,7 @@ def test_package_depends_on_every_interface_that_is_used() -> None:
         package
         for folder in ("rlservo/robots/ros2", "deploy/ros2")
         for file in (source / folder).glob("*.py")
-        for package in re.findall(r'"(\w+)/(?:msg|srv)/\w+"', file.read_text())
+        for package in re.findall(r'"(\w+)/(?:msg|srv|action)/\w+"', file.read_text())
     }
     package = ElementTree.parse(source / "deploy/ros2/package.xml").getroot()
     assert used | {"rclpy"} == {one.text for one in package.findall("exec_depend")}

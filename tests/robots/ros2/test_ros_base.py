@@ -165,3 +165,28 @@ def test_second_node_that_comes_later_on_its_commands_or_odometry_is_a_fault(
         assert ros.moved_for(began_s) < TIMEOUT_S + 2.0 * BRAKING_S
         assert node.end() == 0
         ros.ask("withdraw", topic=topic)
+
+
+def test_scans_are_placed_by_static_frames_of_two_nodes_that_come_late(all_shipped: Path) -> None:
+    """The scanners hang on a mast of another node's; where they are is from the MiR100's own description."""
+    with closing(Ros()) as graph:
+        sim = graph.rlservo("ros2-sim", "mir100", "--world", "lab_6x8")  # its base starts at 0, 2.6
+        sim.wait_for("mir100 on ROS 2")
+        graph.watch("/odom", "nav_msgs/msg/Odometry")
+        sim.type("cube 0 1.45 3.0 0")  # its near side is at the target
+        node = graph.rlservo(
+            "ros2", "--bundle", all_shipped / "mir100_obstacle_avoidance", "--unproven", "--autostart",
+            "--ros-args", "-r", "/tf_static:=/frames",
+        )  # fmt: skip
+        turn = math.pi / 2.0
+        graph.ask("send_frames", topic="/frames", parent="base_link", frames={"mast": (0.1, 0.0, turn)})
+        time.sleep(1.0)
+        # The same places as in base_link: (0.4288, 0.2358) turned by 45 degrees, (-0.3548, -0.2352) by 225.
+        front, back = (0.2358, -0.3288, math.pi / 4 - turn), (-0.2352, 0.4548, -3 * math.pi / 4 - turn)
+        frames = {"front_laser_link": front, "back_laser_link": back}
+        graph.ask("send_frames", topic="/frames", parent="mast", frames=frames)
+        node.wait_for("check -> ready")
+        graph.give_target(1.2, 3.0, frame="odom")
+        node.wait_for("refused: reset option 'target_pose': the scan shows something at the target")
+        sim.type("cube 0 -1.2 3.0 0")
+        graph.begin_driving(1.2, 3.0, frame="odom")
