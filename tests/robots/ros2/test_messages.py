@@ -38,7 +38,7 @@ def test_address_names_its_options() -> None:
 @pytest.mark.parametrize(
     ("robot", "sentence"),
     [
-        ("ros2:speed=3", "'speed=3' is not one of prefix, command"),
+        ("ros2:speed=3", "'speed=3': expected NAME=VALUE with one of prefix, command"),
         ("ros2:command=torque", "command is 'torque', expected position or velocity or trajectory"),
         ("rosbridge://", "expected rosbridge://HOST:9090"),
         ("tcp://x", "expected ros2:, ros2:NAME=VALUE"),
