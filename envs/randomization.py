@@ -121,8 +121,8 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         for model in self._robot_models or (None,):
             if model is not None:
                 self._set_robot_model(model)
-            if isinstance(self._simulation, HasModelError):  # another wrapper may have changed it
-                self._simulation.draw_model_error(0.0, np.random.default_rng())
+            if isinstance(self._robot, HasModelError):  # another wrapper may have changed it
+                self._robot.draw_model_error(0.0, np.random.default_rng())
         if isinstance(env.unwrapped, HasBaseOffset):
             env.unwrapped.set_base_offset((0.0, 0.0))
 
@@ -151,8 +151,8 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
         self._delay = int(self._rng.integers(*self._action_latency, endpoint=True))
         age = int(self._rng.integers(*self._observation_latency, endpoint=True))
         mass = float(self._rng.uniform(*self._payload))
-        if isinstance(self._simulation, CarriesPayload):
-            self._simulation.set_payload(mass)
+        if isinstance(self._robot, CarriesPayload):
+            self._robot.set_payload(mass)
         draws |= {"action_latency": self._delay, "observation_latency": age, "payload": mass}
         draws |= self._draw_model()
         if self._extreme is not None:
@@ -195,8 +195,8 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     def _draw_model(self) -> dict[str, Any]:
         draws: dict[str, Any] = {}
         if self._model_error > 0.0:
-            assert isinstance(self._simulation, HasModelError)
-            draws["model_error"] = self._simulation.draw_model_error(self._model_error, self._streams["model"])
+            assert isinstance(self._robot, HasModelError)
+            draws["model_error"] = self._robot.draw_model_error(self._model_error, self._streams["model"])
         if self._base_offset[1] > 0.0:
             env = self.env.unwrapped
             assert isinstance(env, HasBaseOffset)
@@ -259,15 +259,15 @@ class DomainRandomization(gym.Wrapper[Any, Any, Any, Any]):
     # -- what the environment offers
 
     @property
-    def _simulation(self) -> Any:
-        return getattr(self.env.unwrapped, "simulation", None)
+    def _robot(self) -> Any:
+        return getattr(self.env.unwrapped, "robot", None)
 
     def _check_environment(self) -> None:
         env = self.env.unwrapped
         name = type(env).__name__
-        if self._payload[1] > 0.0 and not isinstance(self._simulation, CarriesPayload):
+        if self._payload[1] > 0.0 and not isinstance(self._robot, CarriesPayload):
             raise ValueError(f"payload is {self._payload}: {name} has no simulation that carries one")
-        if self._model_error > 0.0 and not isinstance(self._simulation, HasModelError):
+        if self._model_error > 0.0 and not isinstance(self._robot, HasModelError):
             raise ValueError(f"model_error is {self._model_error:g}: {name} has no simulation with draw_model_error")
         if self._base_offset[1] > 0.0 and not isinstance(env, HasBaseOffset):
             raise ValueError(f"base_offset is {self._base_offset}: {name} has no set_base_offset")

@@ -209,63 +209,60 @@ def drive_environment(node: PolicyNode, trained_in: str, arguments: Mapping[str,
         check_fit(node.policy.contract, env, arguments)
         if not unproven:
             check_proven(node.policy.contract, env)
-        robot: Any = env.unwrapped
-        simulation = robot.simulation
-        targets = Targets(node.link, simulation.frame if frame == "odom" else frame, partial(_refusal, node))
+        robot: Any = env.unwrapped.robot  # type: ignore[attr-defined]
+        targets = Targets(node.link, robot.frame if frame == "odom" else frame, partial(_refusal, node))
         for word, to_person in (("take_over", True), ("hand_back", False)):
-            node.link.serve(f"~/{word}", partial(_lead, simulation.operator, to_person=to_person))
-        simulation.states.on_change = partial(_say_hold, node)
-        simulation.is_called_off = lambda: (
-            node.stop.is_set() or node.wanted is not Wanted.RUN or targets.newest.is_cancelled
-        )
+            node.link.serve(f"~/{word}", partial(_lead, robot.operator, to_person=to_person))
+        robot.states.on_change = partial(_say_hold, node)
+        robot.is_called_off = lambda: node.stop.is_set() or node.wanted is not Wanted.RUN or targets.newest.is_cancelled
         try:
             _drive_to_targets(node, env, option, targets)
         finally:
             if targets.is_due and targets.newest.goal is not None:
-                _brake(simulation)
+                _brake(env)
             targets.close()
     finally:
         env.close()
 
 
 def _drive_to_targets(node: PolicyNode, env: Any, option: str, targets: Targets) -> None:
-    simulation = env.unwrapped.simulation
+    robot = env.unwrapped.robot
     starts = node.starts
     while not node.stop.is_set():
         target = targets.newest
         if node.state != "fault":
             starts = node.starts
         elif node.starts > starts:
-            simulation.operator.allow_restart()
+            robot.operator.allow_restart()
             node.enter("waiting", "started again")
-            simulation.stopped_by = None
+            robot.stopped_by = None
         else:
             if targets.is_due:
                 log.warning("node: a target was ignored: %s", STOPPED)
                 targets.end(target, "abort", STOPPED)
-            simulation.advance()
+            robot.advance()
             continue
         if targets.is_due and target.is_cancelled:
-            _brake(simulation)
+            _brake(env)
             targets.end(target, "canceled")
-            if node.wanted is Wanted.RUN and not simulation.is_led:
+            if node.wanted is Wanted.RUN and not robot.is_led:
                 node.enter("waiting", "the goal was cancelled")
         elif node.wanted is not Wanted.RUN:
             node.enter("stopped" if node.wanted is Wanted.STOP else "holding", "asked for")
             if node.wanted is Wanted.STOP and target.goal is not None and targets.is_due:
-                _brake(simulation)
+                _brake(env)
                 targets.end(target, "abort", "the stop service was called")
-        elif simulation.is_led:
-            node.enter(simulation.states.state.value)
+        elif robot.is_led:
+            node.enter(robot.states.state.value)
         elif not targets.is_due:
-            if simulation.stopped_by is not None:  # while it stood
-                node.enter("fault", simulation.stopped_by)
+            if robot.stopped_by is not None:  # while it stood
+                node.enter("fault", robot.stopped_by)
             elif node.state not in ("arrived", "failed", "refused"):
                 node.enter("waiting", f"no new target on {node.link.node.resolve_topic_name('~/target')}")
         else:
             _drive_to(node, env, option, targets, target)
             continue
-        simulation.advance()  # the model stays where the robot is
+        robot.advance()  # the model stays where the robot is
 
 
 def _refusal(node: PolicyNode) -> str:
@@ -275,12 +272,13 @@ def _refusal(node: PolicyNode) -> str:
     return STOPPED if node.state == "fault" else ""
 
 
-def _brake(simulation: Any) -> None:
+def _brake(env: Any) -> None:
     """Hold, and wait until the robot stands: a client may touch it once it has its result."""
-    simulation.hold()
+    robot, shown = env.unwrapped.robot, env.unwrapped.simulation
+    robot.hold()
     until_s = time.monotonic() + BRAKING_S
-    while np.abs(simulation.data.qvel).max() > STANDS and time.monotonic() < until_s:
-        simulation.advance()
+    while np.abs(shown.data.qvel).max() > STANDS and time.monotonic() < until_s:
+        robot.advance()
 
 
 def _say_hold(node: PolicyNode, change: Change) -> None:
@@ -302,7 +300,7 @@ def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target:
     As in a rollout an arm first returns to its start: that is where its policy was trained and proven. After an
     interruption it goes on from its present pose.
     """
-    robot, policy = env.unwrapped, node.policy
+    robot, policy = env.unwrapped.robot, node.policy
     number, is_arm = target.number, option == "ee_target_pose"
     goal = [*target.position[: 3 if is_arm else 2]]
     if not np.isfinite(goal).all():  # an arm would return to its start before it is noticed
@@ -312,11 +310,11 @@ def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target:
     goal += [0.0] * ((6 if is_arm else 3) - len(goal))
     if targets.begun != number:
         node.enter("starting")
-    options = {**robot.reset_options(start="here" if targets.begun == number else "own"), option: goal}
+    options = {**env.unwrapped.reset_options(start="here" if targets.begun == number else "own"), option: goal}
     try:
         observation, _ = env.reset(options=options)
     except ValueError as error:
-        if not robot.simulation.is_called_off():
+        if not robot.is_called_off():
             node.enter("fault" if isinstance(error, RobotError) else "refused", str(error))
             targets.end(
                 target, "abort", str(error)
@@ -325,14 +323,14 @@ def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target:
     targets.begun = number
     policy.reset()
     is_first = True
-    while not robot.simulation.is_called_off() and targets.newest is target:
+    while not robot.is_called_off() and targets.newest is target:
         try:
             action = policy.act(observation)
         except RlservoError as error:
             node.enter("holding", error.message)
             node.counts["late"] += 1
-            robot.simulation.hold()
-            robot.simulation.advance()
+            robot.hold()
+            robot.advance()
             return
         node.counts["episodes"] += is_first
         is_first = False
@@ -340,13 +338,13 @@ def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target:
         report_step(policy, step)
         observation, _, terminated, truncated, info = step
         node.counts["decisions"] += 1
-        targets.tell(target, *_whereabouts(robot, is_arm))
+        targets.tell(target, *_whereabouts(env.unwrapped, is_arm))
         state, blocked = info["robot"]["state"], info["robot"].get("blocked", "")
         if terminated or truncated:
-            robot.simulation.hold()
+            robot.hold()
             node.counts["successes"] += bool(info["is_success"])
             log.info("node: target %d: %s", number, info["final_status"])
-            if robot.simulation.stopped_by is not None:
+            if robot.stopped_by is not None:
                 causes = [change["why"] for change in info["robot"].get("changes", []) if change["state"] == "fault"]
                 node.enter("fault", (causes or [info["final_status"]])[-1])
             elif info["is_success"]:
@@ -354,21 +352,21 @@ def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target:
             else:
                 node.enter("failed", info["final_status"] + (f", blocked: {blocked}" if blocked else ""))
             if target.goal is not None:
-                _brake(robot.simulation)
+                _brake(env)
             targets.end(target, "succeed" if node.state == "arrived" else "abort", f"{node.state}: {node.why}")
             return
         if state in ("run", "blend_in"):
             node.enter("blocked" if blocked else "running", blocked)
         else:
             node.enter(state)
-    robot.simulation.hold()
+    robot.hold()
 
 
-def _whereabouts(robot: Any, is_arm: bool) -> tuple[tuple[float, float, float], float]:
+def _whereabouts(env: Any, is_arm: bool) -> tuple[tuple[float, float, float], float]:
     """Return the robot's place in the frame of targets [m], and its distance from the target [m]."""
-    away = robot.target_position() - robot.robot_position()
+    away = env.target_position() - env.robot_position()
     if is_arm:
-        x, y, z = robot.simulation.tool_position.tolist()
+        x, y, z = env.simulation.tool_position.tolist()
         return (x, y, z), float(np.linalg.norm(away))
-    x, y, _ = robot.simulation.pose
+    x, y, _ = env.simulation.pose
     return (x, y, 0.0), float(np.linalg.norm(away[:2]))

@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.mir100.sensor_errors import sensor_errors
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv, Start
-from rlservo.robots.arm_interface import MUJOCO
 from rlservo.robots.checks import ElementInfo, EnvDescription, as_vector, check_action, check_option_names, parse_target
 from rlservo.robots.disturbable import SensorError
 from rlservo.robots.mir100.lasers import pick_beams
@@ -30,6 +29,7 @@ from rlservo.robots.mir100.parameters import (
 )
 from rlservo.robots.mir100.simulation import Mir100Simulation, wrap_angle
 from rlservo.robots.mir100.worlds import Pose
+from rlservo.robots.robot_port import MobileBase
 
 LINEAR_SCALE, ANGULAR_SCALE = 0.5, 0.7  # [m/s], [rad/s], of an action of 1
 SUCCESS_DISTANCE = 0.2  # [m]
@@ -54,6 +54,7 @@ class Mir100Navigation(RenderedEnv):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # type: ignore[misc]
 
     IS_PLANAR = True
+    is_real = False
     RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("start_pose", "target_pose")
     WORLD: ClassVar[str]
     LASER_COUNT: ClassVar[int]  # number of observed readings, evenly picked
@@ -73,17 +74,14 @@ class Mir100Navigation(RenderedEnv):
         failure_reward: float = FAILURE_REWARD,
         step_reward: float = 0.0,
         render_mode: str | None = None,
-        robot: str = MUJOCO,
-        limits: Mapping[str, Any] | None = None,
-        confirm: bool = True,
         target: str | None = None,
     ) -> None:
         del ip, lower_bound_port, upper_bound_port, rs_address  # no robot server to reach
         del rs_state_to_info  # robo-gym's MiR100 environments accept it and put nothing into info either
         super().__init__(render_mode, gui=gui)
         self._given = None if target is None else parse_target(target, TARGET_FORMS)
-        self.is_real = robot != MUJOCO
-        self.simulation = self._build(robot, laser_noise, limits, confirm)
+        self.simulation = Mir100Simulation(self.WORLD, laser_noise=laser_noise)
+        self.robot: MobileBase = self.simulation  # unless a task says otherwise
         self._elements = self.describe()["action"]
         for name, value in (("failure_reward", failure_reward), ("step_reward", step_reward)):
             if not math.isfinite(value):
@@ -157,8 +155,8 @@ class Mir100Navigation(RenderedEnv):
         """Command velocities, let 0.1 s pass, and judge the outcome."""
         linear, angular = check_action(action, self._action_box, self._elements).tolist()
         self._steps += 1
-        self.simulation.command(linear * LINEAR_SCALE, angular * ANGULAR_SCALE)
-        self.simulation.advance()
+        self.robot.command(linear * LINEAR_SCALE, angular * ANGULAR_SCALE)
+        self.robot.advance()
 
         distance, bearing = self._target_polar()
         reward = self._step_reward - LINEAR_COST * abs(linear) - ANGULAR_COST * abs(angular)
@@ -166,7 +164,7 @@ class Mir100Navigation(RenderedEnv):
             reward += PROGRESS_REWARD * (self._previous_distance - distance)
         self._previous_distance = distance
 
-        status = self._failure() or self.simulation.stopped_by
+        status = self._failure() or self.robot.stopped_by
         if status is not None:
             reward = self._failure_reward
         if distance < SUCCESS_DISTANCE:  # in robo-gym's order: arriving outweighs a failure in the same step
@@ -178,7 +176,7 @@ class Mir100Navigation(RenderedEnv):
         info: dict[str, Any] = {}
         if status is not None:
             info = {"final_status": status, "is_success": status == "success"}
-        if (robot := self.simulation.robot_info()) is not None:
+        if (robot := self.robot.robot_info()) is not None:
             info["robot"] = robot
         self._refresh_window()
         if any(self._base_offset):
@@ -187,16 +185,16 @@ class Mir100Navigation(RenderedEnv):
 
     def close(self) -> None:
         """Free the GL context, close the window, and stop a real base."""
-        self.simulation.close()
+        self.robot.close()
         super().close()
 
     def limited(self) -> dict[str, int] | None:
         """Return the number of commands in which each limit of a real base applied; None for a simulated one."""
-        return self.simulation.limited()
+        return self.robot.limited()
 
     def take_over(self) -> None:
         """Leave a real base to a person, or take it back. Raises ValueError for a simulated one."""
-        self.simulation.take_over()
+        self.robot.take_over()
 
     # -- for disturbances
 
@@ -290,21 +288,6 @@ class Mir100Navigation(RenderedEnv):
 
     # -- parts
 
-    def _build(
-        self, robot: str, laser_noise: float, limits: Mapping[str, Any] | None, confirm: bool
-    ) -> Mir100Simulation:
-        if robot == MUJOCO:
-            return Mir100Simulation(self.WORLD, laser_noise=laser_noise)
-        from rlservo.robots.ros2.real_base import RealMir100
-
-        return RealMir100(
-            robot,
-            needs_scan=self.LASER_COUNT > 0,
-            fastest=(LINEAR_SCALE, ANGULAR_SCALE),
-            limits=limits or {},
-            confirm=confirm,
-        )
-
     def _own_target(self, start: Sequence[float]) -> Pose:
         """Return the constructor's target, or a random one."""
         if self._given is None:
@@ -340,7 +323,7 @@ class Mir100Navigation(RenderedEnv):
         observation[1] = bearing
         observation[2:4] = self.simulation.velocity
         if self.LASER_COUNT:
-            observation[4:] = self.simulation.scan[self.observed_beams]
+            observation[4:] = self.robot.scan[self.observed_beams]
         return observation
 
 

@@ -144,9 +144,7 @@ class ObstacleAvoidanceMir100Sim(Mir100Navigation):
 
     def _failure(self) -> str | None:
         is_failure = (
-            self.simulation.in_collision
-            or float(self.simulation.scan.min()) < MIN_READING
-            or self._corner_is_near_a_cube()
+            self.simulation.in_collision or float(self.robot.scan.min()) < MIN_READING or self._corner_is_near_a_cube()
         )
         return "collision" if is_failure else None
 

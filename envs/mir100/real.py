@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from rlservo.envs.mir100.navigation import (
+    ANGULAR_SCALE,
+    LINEAR_SCALE,
     MAX_STEPS,
     MIN_TARGET_DISTANCE,
     SUCCESS_DISTANCE,
@@ -18,7 +20,8 @@ from rlservo.envs.mir100.obstacle_avoidance import ObstacleAvoidanceMir100Sim
 from rlservo.envs.rendering import Start
 from rlservo.robots.checks import InvalidResetError
 from rlservo.robots.mir100.parameters import CYCLE_S
-from rlservo.robots.mir100.worlds import Pose
+from rlservo.robots.mir100.worlds import EMPTY, Pose
+from rlservo.robots.ros2.real_base import RealMir100
 
 FARTHEST, AHEAD = 1.5, math.pi / 3  # [m], [rad] on either side, of random targets
 REDRAWS = 100
@@ -28,14 +31,25 @@ class _RealBase(Mir100Navigation):
     """Differences of a real base: an episode begins where it stands, and its world is not known."""
 
     RESET_OPTIONS: ClassVar[tuple[str, ...]] = ("target_pose",)
-    simulation: Any  # RealMir100, which is imported only where there is a robot
+    WORLD = EMPTY.name
+    is_real = True
 
-    def __init__(self, *, robot: str = "", **arguments: Any) -> None:
+    def __init__(
+        self, *, robot: str = "", limits: Mapping[str, Any] | None = None, confirm: bool = True, **arguments: Any
+    ) -> None:
         if not robot:
             raise ValueError(
                 "robot is missing: expected the base's address, such as robot=ros2: or rosbridge://HOST:9090"
             )
-        super().__init__(robot=robot, **arguments)
+        super().__init__(**arguments)
+        self.robot = self._base = RealMir100(
+            robot,
+            self.simulation,
+            needs_scan=self.LASER_COUNT > 0,
+            fastest=(LINEAR_SCALE, ANGULAR_SCALE),
+            limits=limits or {},
+            confirm=confirm,
+        )
 
     def reset_options(self, *, start: Start = "own", keep_target: bool = False) -> dict[str, Any]:
         """Return the options of an episode that starts where the base stands."""
@@ -48,7 +62,7 @@ class _RealBase(Mir100Navigation):
         return ""
 
     def _random_start(self) -> Pose:
-        x, y, yaw = self.simulation.present_pose()
+        x, y, yaw = self._base.present_pose()
         return x, y, yaw
 
     def _random_target(self, start: Sequence[float]) -> Pose:
@@ -64,15 +78,15 @@ class _RealBase(Mir100Navigation):
 
     def _refusal(self, target: Sequence[float]) -> str:
         """Return why a target is refused; empty if it is not."""
-        return self._out_of_reach(target) or self.simulation.unreachable(
+        return self._out_of_reach(target) or self._base.unreachable(
             *target[:2], within=SUCCESS_DISTANCE, time_s=MAX_STEPS * CYCLE_S
         )
 
     def _place(self, start: Sequence[float], target: Sequence[float], options: Mapping[str, Any]) -> None:
-        del options
+        del start, options
         if why := self._refusal(target):
             raise InvalidResetError(f"reset option 'target_pose': {why}")
-        self.simulation.place(start, target=target)
+        self._base.start_towards(target)
         if (status := self._failure()) is not None:
             raise InvalidResetError(
                 f"the base stands where an episode would end at once ({status}): drive it away by hand"

@@ -150,7 +150,7 @@ class EmptyEnvironmentPandaSim(PandaArmEnv):
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         del options  # the start pose is the only one
-        self.simulation.settle()
+        self.robot.settle()
 
     def _observation(self) -> Observation:
         sim = self.simulation

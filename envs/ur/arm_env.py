@@ -10,7 +10,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -29,11 +29,15 @@ from rlservo.robots.checks import (
     check_option_names,
     parse_target,
 )
-from rlservo.robots.connect_arm import make_arm
+from rlservo.robots.connect_arm import connect_arm
 from rlservo.robots.kept_latency import kept_latency_ms
+from rlservo.robots.robot_port import Arm
 from rlservo.robots.ur.model import BASE_HEIGHT, Table
 from rlservo.robots.ur.parameters import JOINT_NAMES, JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.robots.ur.simulation import VIEW, ArmSimulation, URSimulation
+
+if TYPE_CHECKING:
+    from rlservo.robots.real_arm import RealArm
 
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
 BASE: NDArray[np.float64] = np.array([0.0, 0.0, BASE_HEIGHT])  # [m], base_link in MuJoCo's world
@@ -91,6 +95,7 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         super().__init__(render_mode, gui=gui)
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self.simulation = make_simulation()
+        self.robot: Arm = self.simulation  # unless a task says otherwise
         self._free = np.flatnonzero(~np.array(fixed))
         self._fixed = np.flatnonzero(fixed)
         self._rs_state_to_info = rs_state_to_info
@@ -145,12 +150,12 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         command = np.empty(len(self.JOINTS))
         command[self._free] = values
         command[self._fixed] = self._fixed_values()[self._fixed]
-        self.simulation.command(self._to_joint_positions(command))
-        self.simulation.advance()
+        self.robot.command(self._to_joint_positions(command))
+        self.robot.advance()
 
         observation = self._observation()
         reward, status = self._judge(observation, command)
-        status = status or self.simulation.stopped_by
+        status = status or self.robot.stopped_by
         terminated = status is not None
         truncated = not terminated and self._steps >= self.MAX_STEPS
         if truncated:
@@ -160,14 +165,14 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
             info = {"final_status": status, "is_success": status == "success", **self._final_info(status)}
         if self._rs_state_to_info:
             info["rs_state"] = self._rs_state()
-        if (robot := self.simulation.robot_info()) is not None:
+        if (robot := self.robot.robot_info()) is not None:
             info["robot"] = robot
         self._refresh_window()
         return observation, reward, terminated, truncated, info
 
     def limited(self) -> dict[str, int] | None:
         """Return the number of command cycles in which each limit of a real arm applied; None for a simulated arm."""
-        return self.simulation.limited()
+        return self.robot.limited()
 
     # -- for disturbances
 
@@ -281,12 +286,12 @@ class ArmEnv(RenderedEnv, Generic[Simulation]):
         for _ in range(REDRAWS):
             draw = self.np_random.uniform(centre - reach, centre + reach)
             joints: Vector = np.clip(draw, self.LOW, self.HIGH)
-            if not self.simulation.place(joints):
+            if not self.robot.place(joints):
                 return joints
         raise InvalidResetError(f"all {REDRAWS} random starts around the given joint positions collide")
 
     def _place_arm_at(self, joints: Vector) -> Vector:
-        if self.simulation.place(joints):
+        if self.robot.place(joints):
             links = " and ".join(self.simulation.contacts()[0])
             raise InvalidResetError(f"the start joint positions collide: {links} touch")
         return joints
@@ -340,12 +345,7 @@ class URArmEnv(ArmEnv[URSimulation]):
         scale = self.MAX_VELOCITY_SCALE if max_velocity_scale_factor is None else max_velocity_scale_factor
         rate_hz = self.RATE_HZ if action_cycle_rate is None else action_cycle_rate
         self._build = partial(
-            make_arm,
-            robot,
-            limits=limits,
-            confirm=confirm,
-            metrics=metrics,
-            dry_run=dry_run,
+            URSimulation,
             max_velocity_scale=scale,
             cycle_s=cycle_of(rate_hz),
             objects=self.OBJECTS,
@@ -366,13 +366,14 @@ class URArmEnv(ArmEnv[URSimulation]):
         self._simulations = {ur_model: self.simulation}  # an arm that is chosen again is not built again
         self._given = None if given is None else self._pose_of(*given)
         self._aimed: Vector | None = None  # the target that a real arm's operator was asked about
-        if self.is_real and self.WITHIN:
-            self.simulation.aim = self._aim
+        self.robot = connect_arm(
+            robot, self.simulation, limits=limits, confirm=confirm, metrics=metrics, dry_run=dry_run,
+            aim=self._aim if self.WITHIN else None,
+        )  # fmt: skip
 
     def close(self) -> None:
         """Free the GL context, close the window, and stop a real arm."""
-        for simulation in self._simulations.values():
-            simulation.close()
+        self.robot.close()
         super().close()
 
     def set_robot_model(self, name: str) -> None:
@@ -381,13 +382,13 @@ class URArmEnv(ArmEnv[URSimulation]):
             raise ValueError(f"a real arm cannot be replaced by {name!r}")
         simulation = self._simulations.get(name) or self._simulations.setdefault(name, self._build(name))
         if simulation is not self.simulation:
-            self.simulation = simulation
+            self.robot = self.simulation = simulation
             self._camera.close()
             self._camera = Camera(simulation.model, simulation.data, **VIEW)
 
     def take_over(self) -> None:
         """Let a person lead a real arm by hand, or give it back. Raises ValueError for a simulated one."""
-        self.simulation.take_over()
+        self.robot.take_over()
 
     @property
     def measured_latency_ms(self) -> float | None:
@@ -421,7 +422,7 @@ class URArmEnv(ArmEnv[URSimulation]):
         pose = np.concatenate([numbers, self.TARGET_TURN])[:6]
         return pose if frame == "base_link" else pose * (-1, -1, 1, 1, 1, 1) + (0, 0, 0, 0, 0, math.pi)
 
-    def _aim(self, start: Vector) -> str:
+    def _aim(self, arm: RealArm, start: Vector) -> str:
         """Choose a real arm's target before it moves to `start` [rad] (6,). Raises InvalidResetError, naming why not.
 
         A random one is in front of the robot, and neither at its start nor out of its reach.
@@ -434,7 +435,7 @@ class URArmEnv(ArmEnv[URSimulation]):
             if asked is None and (abs(math.atan2(y, x)) > FRONT or math.dist(tool, pose[:3]) < 2.0 * self.WITHIN):
                 continue
             words = "(" + ", ".join(f"{value:.2f}" for value in pose[:3] + 0.0) + ") m in base_link"
-            why = self.simulation.unreachable(
+            why = arm.unreachable(
                 pose[:3], start, within=self.WITHIN, time_s=self.MAX_STEPS / self.metadata["render_fps"]
             )
             if not why:

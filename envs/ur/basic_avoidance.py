@@ -169,10 +169,10 @@ class BasicAvoidanceURSim(URArmEnv):
 
     def _start_object(self, function: str, parameters: dict[str, float], *, refuse: bool = True) -> bool:
         sim = self.simulation
-        sim.place(self._start)
+        self.robot.place(self._start)
         path = object_path(function, 0, {f"object_0_{name}": v for name, v in parameters.items()}, self.np_random)
         sim.move_objects({0: path})
-        sim.settle()
+        self.robot.settle()
         if sim.in_collision and refuse:
             x, y, z = sim.object_position(0).tolist()
             raise InvalidResetError(

@@ -92,7 +92,7 @@ class EmptyEnvironmentURSim(URArmEnv):
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         del options  # the start pose is the only one
-        self.simulation.settle()
+        self.robot.settle()
 
     def _fixed_values(self) -> Vector:
         return self._start / LIMITS

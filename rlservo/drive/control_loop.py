@@ -131,7 +131,7 @@ def rollout(
         wall_s = time.perf_counter() - began
         limited: Callable[[], dict[str, int] | None] = getattr(env.unwrapped, "limited", lambda: None)
         robot = limited()
-        rehearsal = getattr(getattr(env.unwrapped, "simulation", None), "rehearsal", None)
+        rehearsal = getattr(getattr(env.unwrapped, "robot", None), "rehearsal", None)
     latencies_s = paced.latencies_s
     (success,) = success_rates([row.success for row in rows])
     returns = np.array([row.episode_return for row in rows])

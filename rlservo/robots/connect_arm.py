@@ -1,54 +1,50 @@
-"""Arms by address: a simulated scene for `mujoco`, a real arm's mirror for `rtde://HOST`."""
+"""Arms by address: the simulation itself for `mujoco`, a real arm for `rtde://HOST`."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rlservo.robots.arm_interface import host_of
+from rlservo.robots.robot_port import Arm
 from rlservo.robots.ur.simulation import URSimulation
 
+if TYPE_CHECKING:
+    from rlservo.robots.arm_process import ArmProcess
+    from rlservo.robots.real_arm import Aim
 
-def make_arm(
+
+def connect_arm(
     robot: str,
-    ur_model: str,
+    simulation: URSimulation,
     *,
     limits: Mapping[str, Any] | None = None,
     confirm: bool = True,
     metrics: str | None = None,
     dry_run: bool = False,
-    **scene: Any,
-) -> URSimulation:
-    """Return the arm and its scene; `scene` is `URSimulation`'s. Raises RobotError if it cannot be reached.
+    aim: Aim | None = None,
+) -> Arm:
+    """Return the arm that the simulation is of. Raises RobotError if it cannot be reached.
 
-    `dry_run` rehearses a real arm from its present pose, and sends it nothing.
+    `dry_run` rehearses a real arm from its present pose, and sends it nothing. `aim` is `RealArm`'s.
     """
     host = host_of(robot)
     if host is None:
-        return URSimulation(ur_model, **scene)
+        return simulation
     from rlservo.robots.arm_process import ArmProcess
     from rlservo.robots.limits import Limits
     from rlservo.robots.operator_terminal import Operator
     from rlservo.robots.real_arm import RealArm
 
     checked = Limits.of({} if limits is None else limits)
+    model, scale = simulation.ur_model, simulation.velocity_scale
 
     if dry_run:
         from rlservo.robots.rehearsed_arm import Rehearsal, RehearsedArm
 
-        def rehearsed(_timeout_s: float) -> Any:
-            return RehearsedArm(host, ur_model, velocity_scale=scene["max_velocity_scale"], limits=checked)
+        return Rehearsal(simulation, RehearsedArm(host, model, velocity_scale=scale, limits=checked), aim)
 
-        return Rehearsal(ur_model, connect=rehearsed, operator=Operator(is_asked=False), **scene)
+    def connect(timeout_s: float) -> ArmProcess:
+        return ArmProcess(host, model, velocity_scale=scale, setpoint_timeout_s=timeout_s, limits=checked)
 
-    def connect(setpoint_timeout_s: float) -> ArmProcess:
-        return ArmProcess(
-            host,
-            ur_model,
-            velocity_scale=scene["max_velocity_scale"],
-            setpoint_timeout_s=setpoint_timeout_s,
-            limits=checked,
-        )
-
-    operator = Operator(is_asked=confirm)
-    return RealArm(ur_model, connect=connect, operator=operator, metrics=metrics, **scene)
+    return RealArm(simulation, connect=connect, operator=Operator(is_asked=confirm), aim=aim, metrics=metrics)

@@ -1,27 +1,22 @@
-"""A real arm in place of the simulated one: the environments see it through the scene's model.
-
-The model follows the arm's measured positions, so that tool, contacts and pictures are computed as in the simulator;
-commands go to the arm.
-"""
+"""A real arm, which a simulation follows: tool, contacts and pictures are computed from its measured positions."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rlservo.robots.arm_interface import ArmState, RobotError
-from rlservo.robots.arm_process import ArmProcess
 from rlservo.robots.arm_states import ControlState
 from rlservo.robots.checks import InvalidResetError
-from rlservo.robots.limits import WALL_MARGIN
+from rlservo.robots.limits import WALL_MARGIN, Limits
 from rlservo.robots.operator_terminal import Operator
-from rlservo.robots.real_robot import RealRobot
+from rlservo.robots.real_robot import CommandedRobot, RealRobot
 from rlservo.robots.servo_loop import AGE_BOUND_S
 from rlservo.robots.ur.simulation import URSimulation
 
@@ -33,29 +28,42 @@ PATH_STEP = 0.05  # [rad], between two checked poses of a path
 SETTLE_S = 0.2
 
 Vector = NDArray[np.float64]
+Aim = Callable[["RealArm", Vector], str]
 
 
-# `stopped_by` has one type in both bases.
-class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The scene of a real arm. `close` also closes the object that `connect` returns."""
+class CommandedArm(CommandedRobot, Protocol):
+    """An arm behind a servo loop, or its rehearsal."""
+
+    host: str
+    limits: Limits
+
+    @property
+    def scale(self) -> float: ...
+    def arm_state(self) -> ArmState: ...
+    def setpoint(self) -> Vector: ...
+    def command(self, joint_positions: ArrayLike, duration_s: float) -> None: ...
+    def go_to(self, joint_positions: ArrayLike, is_interrupted: Callable[[], bool]) -> None: ...
+
+
+class RealArm(RealRobot[CommandedArm, ArmState]):
+    """An arm that moves; `close` also closes the object that `connect` returns."""
 
     def __init__(
         self,
-        ur_model: str,
+        simulation: URSimulation,
         *,
-        connect: Callable[[float], ArmProcess],
+        connect: Callable[[float], CommandedArm],
         operator: Operator,
-        max_velocity_scale: float,
-        cycle_s: float,
+        aim: Aim | None = None,
         metrics: str | None = None,
-        **scene: Any,
     ) -> None:
         """Connect. `connect` takes the time [s] after which the arm holds without a setpoint; its errors are raised.
 
-        `metrics` is the address, HOST:PORT, at which Prometheus reads the arm's metrics.
+        `aim` is called before a motion to a start [rad] (6,): it chooses the target and returns it in words. `metrics`
+        is the address, HOST:PORT, at which Prometheus reads the arm's metrics.
         """
-        URSimulation.__init__(self, ur_model, max_velocity_scale=max_velocity_scale, cycle_s=cycle_s, **scene)
-        RealRobot.__init__(self, connect, operator, cycle_s=cycle_s, age_bound_s=AGE_BOUND_S)
+        super().__init__(connect, operator, cycle_s=simulation.cycle_s, age_bound_s=AGE_BOUND_S)
+        self.simulation, self._aim = simulation, aim
         self._confirmed: list[tuple[Vector, str]] = []  # starts and targets that the operator has agreed to
         self._metrics: ArmMetrics | None = None
         if metrics is not None:
@@ -70,7 +78,7 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
                 raise
         self._look()
 
-    # -- instead of the simulation's
+    # -- of the port
 
     def place(self, joint_positions: ArrayLike) -> bool:
         """Move the arm slowly to joint positions [rad] (6,), after confirmation; return whether it would collide there.
@@ -79,16 +87,17 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
         something is in the way or the motion is called off, RobotError if the robot has stopped.
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
-        if super().place(goal):
+        if self.simulation.place(goal):
             return True
         self._recover()
-        target = "" if self.aim is None else self.aim(goal)
+        target = "" if self._aim is None else self._aim(self, goal)
         if not self.is_led:
             self._go_to(goal, target)
-        self.in_collision, self.stopped_by = False, None
+        self.simulation.in_collision = False
+        self.stopped_by = None
         self._look()
         self._begin()
-        return self.in_collision
+        return self.simulation.in_collision
 
     def settle(self) -> None:
         """Wait until the arm is at rest."""
@@ -98,28 +107,25 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
 
     def command(self, joint_positions: ArrayLike) -> None:
         """Replace the setpoint, unless a person leads the arm or the observation is too old to act on."""
-        self.data.act[:] = self._robot.setpoint()
-        super().command(joint_positions)
+        self.simulation.data.act[:] = self._robot.setpoint()
+        duration_s = self.simulation.command(joint_positions)
         if self._may_act():
-            self._robot.command(joint_positions, self._remaining * self.model.opt.timestep)
+            self._robot.command(joint_positions, duration_s)
         else:
-            self._velocity[:] = 0.0
+            self.simulation.hold()
 
     def hold(self) -> None:
         """Stop where the arm is."""
-        self._velocity[:] = 0.0
+        self.simulation.hold()
         super().hold()
-
-    def arm_state(self) -> ArmState:
-        """Return the newest state of the arm."""
-        return self._robot.arm_state()
 
     def unreachable(self, position: Vector, start: Vector, *, within: float, time_s: float) -> str:
         """Return why the flange cannot get to `within` [m] of a position in base_link [m] (3,); empty if it may.
 
         `start` are the joints [rad] (6,) from which it begins, `time_s` an episode's time at the present speed.
         """
-        limits, tool = self._robot.limits, self.tool_at(start)[0]
+        limits, simulation = self._robot.limits, self.simulation
+        tool = simulation.tool_at(start)[0]
         low, high = np.array(limits.box_low) + WALL_MARGIN, np.array(limits.box_high) - WALL_MARGIN
         if (beyond := float(np.linalg.norm(position - np.clip(position, low, high)))) > within:
             return f"it is {beyond:.2f} m outside the box of the limits for the flange, from {_m(low)} to {_m(high)} m"
@@ -128,11 +134,11 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
         way = math.dist(tool, position)
         edge = position + (tool - position) * min(1.0, within / max(way, 1e-9))
         scale, nearest, needed_s = self._robot.scale, math.inf, math.inf
-        speeds = self.max_velocity * limits.speed_scale * scale
+        speeds = simulation.max_velocity * limits.speed_scale * scale
         for first in (start, turned):
-            joints = np.clip(self.joints_towards(position, start=first), limits.position_low, limits.position_high)
-            if (gap := math.dist(self.tool_at(joints)[0], position)) <= within:
-                turns = np.abs(self.joints_towards(edge, start=first) - start)
+            joints = simulation.joints_towards(position, start=first).clip(limits.position_low, limits.position_high)
+            if (gap := math.dist(simulation.tool_at(joints)[0], position)) <= within:
+                turns = np.abs(simulation.joints_towards(edge, start=first) - start)
                 needed_s = min(needed_s, float((turns / np.maximum(speeds, 1e-9)).max()))
             nearest = min(nearest, gap)
         if nearest > within:
@@ -158,8 +164,8 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
         start = self._robot.arm_state().positions
         away = float(np.abs(goal - start).max())
         for share in np.linspace(0.0, 1.0, 2 + int(away / PATH_STEP)):
-            if super().place(start + share * (goal - start)) and share > 0.0:
-                links = " and ".join(self.contacts()[0])
+            if self.simulation.place(start + share * (goal - start)) and share > 0.0:
+                links = " and ".join(self.simulation.contacts()[0])
                 raise InvalidResetError(f"{links} would touch on the straight path to the start: move the arm by hand")
         self._confirm(start, goal, target)
         if away > AT_START:
@@ -184,7 +190,7 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
         away = np.abs(goal - start)
         start_speed = limits.start_speed * limits.speed_scale * scale
         seconds = float(away.max()) / max(start_speed, 1e-6) + limits.blend_s
-        fastest = float(self.max_velocity.max()) * limits.speed_scale * scale
+        fastest = float(self.simulation.max_velocity.max()) * limits.speed_scale * scale
         slider = f"at the present speed scaling of {scale:.0%}"
         self.operator.confirm(
             f"the robot will move from {_listed(start)} to its start {_listed(goal)} rad, {away.max():.2f} rad in "
@@ -193,17 +199,16 @@ class RealArm(RealRobot[ArmProcess, ArmState], URSimulation):  # pyright: ignore
         )
         self._confirmed.append((goal, target))
 
-    # -- the mirror's
-
     def _newest(self) -> ArmState:
         return self._robot.arm_state()
 
     def _show(self, state: ArmState) -> None:
-        self.data.qpos[:] = state.positions
-        self.data.qvel[:] = state.velocities
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_collision(self.model, self.data)
-        self.in_collision = self.in_collision or self.data.ncon > 0
+        model, data = self.simulation.model, self.simulation.data
+        data.qpos[:] = state.positions
+        data.qvel[:] = state.velocities
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        self.simulation.in_collision |= data.ncon > 0
 
 
 def _m(place: Vector) -> str:

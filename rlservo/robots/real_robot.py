@@ -1,6 +1,6 @@
-"""A real robot in place of a simulated one: the common part of the mirrors of an arm and of a base.
+"""The common part of a real arm and a real base.
 
-The model follows the robot's measured state, and a control cycle passes in real time. The state machine around the
+A simulation follows the robot's measured state, and a control cycle passes in real time. The state machine around the
 policy is here: faults and connecting again, a person who takes over, late and stale commands.
 """
 
@@ -57,9 +57,9 @@ MeasuredT = TypeVar("MeasuredT", bound=Measured)
 
 
 class RealRobot(ABC, Generic[RobotT, MeasuredT]):
-    """The robot's side of a mirror; the other base class is the simulation that it replaces."""
+    """A robot that a policy drives through `robot_port.Robot`, and the simulation that shows it."""
 
-    stopped_by: str | None
+    stopped_by: str | None = None
 
     def __init__(
         self, connect: Callable[[float], RobotT], operator: Operator, *, cycle_s: float, age_bound_s: float
@@ -80,7 +80,7 @@ class RealRobot(ABC, Generic[RobotT, MeasuredT]):
         """Whether a person leads the robot, or will once it is at rest."""
         return self._is_led or self.operator.has_taken_over
 
-    # -- what a mirror adds
+    # -- what an arm or a base adds
 
     @abstractmethod
     def _newest(self) -> MeasuredT:
@@ -88,16 +88,16 @@ class RealRobot(ABC, Generic[RobotT, MeasuredT]):
 
     @abstractmethod
     def _show(self, state: MeasuredT) -> None:
-        """Set the model to the robot's state."""
+        """Set the simulation to the robot's state."""
 
-    # -- instead of the simulation's
+    # -- of the port
 
     def hold(self) -> None:
         """Decelerate and hold, unless a person leads the robot."""
         if not self.is_led:
             self._robot.hold()
 
-    def advance(self, substeps: int = 0) -> None:  # noqa: ARG002  # a simulated base's
+    def advance(self) -> None:
         """Wait for the end of the control cycle and read the robot's state."""
         now = time.monotonic()
         self._due_s = max(self._due_s + self._cycle_s, now)  # a cycle that was missed is not caught up
@@ -105,7 +105,7 @@ class RealRobot(ABC, Generic[RobotT, MeasuredT]):
         self._look()
         self._follow_states()
 
-    def robot_info(self) -> dict[str, Any] | None:
+    def robot_info(self) -> dict[str, Any]:
         """Return the state, its changes and the applied limits since the last call."""
         counts = self.limited()
         new = {name: count - self._counts.get(name, 0) for name, count in counts.items()}
@@ -134,7 +134,7 @@ class RealRobot(ABC, Generic[RobotT, MeasuredT]):
         self.operator.close()
         self._robot.close()
 
-    # -- for mirrors
+    # -- for an arm and a base
 
     def _recover(self) -> None:
         """Connect again after a fault, once a person agrees. Raises RobotError without, or if it is not ready."""
@@ -166,7 +166,7 @@ class RealRobot(ABC, Generic[RobotT, MeasuredT]):
         return False
 
     def _look(self) -> None:
-        """Set the model to the robot's state; hold and wait until it is fresh."""
+        """Set the simulation to the robot's state; hold and wait until it is fresh."""
         limit = time.monotonic() + FRESH_S
         state = self._newest()
         while _age_s(state) > self._age_bound_s and not self._note_fault():

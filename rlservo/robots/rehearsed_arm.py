@@ -16,8 +16,9 @@ from rlservo.robots.arm_interface import ArmState, RobotError, Vector
 from rlservo.robots.arm_process import AT_REST, REACHED
 from rlservo.robots.control_law import ControlLaw, Order, Phase
 from rlservo.robots.limits import COUNTED, Limits, MotionLimiter
+from rlservo.robots.operator_terminal import Operator
 from rlservo.robots.readiness import present_state
-from rlservo.robots.real_arm import RealArm
+from rlservo.robots.real_arm import Aim, RealArm
 from rlservo.robots.servo_loop import FORGET_S
 from rlservo.robots.ur.simulation import URSimulation
 
@@ -148,18 +149,18 @@ class RehearsedArm:
 
 
 class Rehearsal(RealArm):
-    """The scene of a rehearsed arm, whose cycles take no time."""
+    """A rehearsed arm in place of a real one: its cycles take no time."""
+
+    def __init__(self, simulation: URSimulation, arm: RehearsedArm, aim: Aim | None) -> None:
+        super().__init__(simulation, connect=lambda _: arm, operator=Operator(is_asked=False), aim=aim)
+        self._rehearsed = arm
 
     @property
     def rehearsal(self) -> list[dict[str, Any]]:
         """The motions that were rehearsed."""
         return list(self._rehearsed.rows)
 
-    @property
-    def _rehearsed(self) -> Any:
-        return self._robot
-
-    def advance(self, substeps: int = 0) -> None:  # noqa: ARG002  # a simulated base's
+    def advance(self) -> None:
         """Let a control cycle pass."""
         self._rehearsed.pass_time(self._cycle_s)
         self._look()

@@ -20,6 +20,7 @@ import pytest
 
 from arms import LIMITS, PATIENCE_S, RunningArm, run_arm
 from rlservo.drive.control_loop import rollout
+from rlservo.envs.randomization import DomainRandomization
 from rlservo.errors import UsageError
 from rlservo.policy.policy import Policy
 from rlservo.recording.episodes import episodes
@@ -49,6 +50,19 @@ def real_env(arm: RunningArm, **arguments: Any) -> Iterator[gym.Env[Any, Any]]:
         yield env
     finally:
         env.close()
+
+
+def test_nothing_that_is_for_simulations_reaches_a_real_arm(arm: RunningArm) -> None:
+    with real_env(arm) as env:
+        observation, _ = env.reset(options={"ee_target_pose": [0.3, 0.1, 0.6, 0.0, 0.0, 0.0]})
+        before, elsewhere = arm.controller.simulation.joint_positions.copy(), observation[None].copy()
+        elsewhere[0, 3] += 0.1
+        env.unwrapped.show_observations(elsewhere, 0)  # type: ignore[attr-defined]
+        env.unwrapped.extreme_options("start", np.random.default_rng(0))  # type: ignore[attr-defined]
+        assert abs(arm.controller.simulation.joint_positions - before).max() < 0.01
+        for disturbance in ({"payload": (1.0, 1.0)}, {"model_error": 0.1}):
+            with pytest.raises(ValueError, match="EndEffectorPositioningURRob has no simulation"):
+                DomainRandomization(env, **disturbance)
 
 
 def test_env_drives_the_arm_to_its_target_within_the_limits(arm: RunningArm) -> None:
@@ -107,8 +121,8 @@ def test_slow_policy_holds_the_arm_and_its_action_for_an_old_observation_is_not_
         time.sleep(1.0)
         assert abs(arm.controller.simulation.joint_velocities).max() < 0.02
         _, _, _, _, info = env.step(action)
-        simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
-        assert simulation.stale_actions >= 1
+        robot = env.unwrapped.robot  # type: ignore[attr-defined]
+        assert robot.stale_actions >= 1
         states = [change["state"] for change in info["robot"].get("changes", [])]
         assert "hold" in states
         for _ in range(10):
@@ -184,7 +198,7 @@ def test_protective_stop_ends_the_episode_and_the_next_reset_says_what_to_do(arm
             _, _, terminated, _, info = env.step(action)
         assert info["final_status"] == "protective_stop"
         assert info["robot"]["state"] == "fault"
-        operator = env.unwrapped.simulation.operator  # type: ignore[attr-defined]
+        operator = env.unwrapped.robot.operator  # type: ignore[attr-defined]
         operator.allow_restart()
         with pytest.raises(RobotError, match="in protective stop: find the cause"):
             env.reset(seed=2)
@@ -200,10 +214,10 @@ def test_protective_stop_ends_the_episode_and_the_next_reset_says_what_to_do(arm
 def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -> None:
     with real_env(arm) as env:
         env.reset(seed=1)
-        simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
+        robot = env.unwrapped.robot  # type: ignore[attr-defined]
         action = np.array([0.3, -0.4, 0.5, 0.0, -0.2], dtype=np.float32)
         env.step(action)
-        simulation.operator.toggle()
+        robot.operator.toggle()
         limit = time.monotonic() + PATIENCE_S
         while not arm.controller.is_free:
             _, _, _, _, info = env.step(action)
@@ -215,12 +229,12 @@ def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -
             env.step(action)
             assert time.monotonic() < limit
         arm.do(lambda: arm.controller.simulation.data.qfrc_applied.__setitem__(0, 0.0))
-        simulation.hold()  # an episode's end, or a late answer of the policy's server, takes nothing from the person
+        robot.hold()  # an episode's end, or a late answer of the policy's server, takes nothing from the person
         env.reset(options={"joint_positions": START + 0.5})
         for _ in range(5):
             _, _, _, _, info = env.step(action)
         assert arm.controller.is_free and info["robot"]["state"] == "human"
-        simulation.operator.toggle()
+        robot.operator.toggle()
         states = []
         for _ in range(30):
             _, _, terminated, _, info = env.step(action)
@@ -229,7 +243,7 @@ def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -
                 break
         assert "blend_in" in states
 
-        simulation.operator.toggle()
+        robot.operator.toggle()
         env.reset(options={"joint_positions": START + 1.0})  # on the way to a start, too
         while not arm.controller.is_free:
             env.step(action)
@@ -241,14 +255,14 @@ def test_person_takes_the_arm_over_leads_it_and_gives_it_back(arm: RunningArm) -
 def test_person_is_asked_to_lead_the_arm_only_when_it_stands(arm: RunningArm) -> None:
     with real_env(arm, limits={**LIMITS, "acceleration": 0.3}) as env:
         env.reset(seed=1)
-        simulation = env.unwrapped.simulation  # type: ignore[attr-defined]
+        robot = env.unwrapped.robot  # type: ignore[attr-defined]
         action = np.array([1.0, 0.0, 0.0, 0.0, 0.0], dtype=np.float32)
         speed = lambda: float(abs(arm.controller.simulation.joint_velocities).max())  # noqa: E731
         limit = time.monotonic() + PATIENCE_S
         while speed() < 0.15:
             env.step(action)
             assert time.monotonic() < limit
-        simulation.operator.toggle()
+        robot.operator.toggle()
         states = []
         while "human" not in states:
             states.append(env.step(action)[-1]["robot"]["state"])
@@ -257,14 +271,14 @@ def test_person_is_asked_to_lead_the_arm_only_when_it_stands(arm: RunningArm) ->
         assert now < 0.02 and arm.controller.is_free
         assert set(states[1:-1]) == {"hold"}
 
-        simulation.operator.toggle()
+        robot.operator.toggle()
         while speed() < 0.15:
             env.step(action)
             assert time.monotonic() < limit
-        simulation.operator.toggle()  # and back before it stands
+        robot.operator.toggle()  # and back before it stands
         for _ in range(2):
             assert env.step(action)[-1]["robot"]["state"] != "human"
-        simulation.operator.toggle()
+        robot.operator.toggle()
         states = []
         while "run" not in states:
             states.append(env.step(action)[-1]["robot"]["state"])

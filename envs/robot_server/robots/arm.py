@@ -1,4 +1,4 @@
-"""An arm with robo-gym's interface, on the arm's simulation.
+"""An arm with robo-gym's interface.
 
 Source of the behaviour: jr-robotics/robo-gym-robot-servers, ur_robot_server and panda_robot_server.
 """
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from rlservo.envs.rendering import Camera
 from rlservo.envs.robot_server.robot_server_settings import ArmSettings
 from rlservo.envs.robot_server.robots.robot import RobotState
+from rlservo.robots.robot_port import Arm
 from rlservo.robots.ur.object_paths import object_path
 from rlservo.robots.ur.parameters import cycle_of
 from rlservo.robots.ur.simulation import SETTLE_CYCLES, VIEW, ArmSimulation
@@ -32,10 +33,11 @@ class ArmRobot(ABC, Generic[Simulation]):
     LOW: ClassVar[NDArray[np.float64]]  # [rad]
     HIGH: ClassVar[NDArray[np.float64]]
 
-    def __init__(self, settings: ArmSettings, simulation: Simulation, initial: Sequence[float]) -> None:
+    def __init__(self, settings: ArmSettings, simulation: Simulation, robot: Arm, initial: Sequence[float]) -> None:
         """`initial` is where a simulated arm stands until the first SetState [rad]."""
         self._settings = settings
-        self.simulation = simulation
+        self.simulation, self._robot = simulation, robot
+        self.is_real = robot is not simulation
         self.camera = Camera(simulation.model, simulation.data, **VIEW)
         self._to_base = np.ones(3)  # of a position in the reference frame
         self._rng = np.random.default_rng(settings.seed)
@@ -43,10 +45,6 @@ class ArmRobot(ABC, Generic[Simulation]):
         self._string_params: dict[str, str] = {}
         if not self.is_real:
             simulation.place(initial)
-
-    @property
-    def is_real(self) -> bool:
-        return False
 
     @property
     def cycle_s(self) -> float:
@@ -77,11 +75,11 @@ class ArmRobot(ABC, Generic[Simulation]):
             if function is not None:  # else it stays out of the way
                 paths[index] = object_path(function, index, floats, self._rng) * self._to_base
         self._float_params, self._string_params = floats, strings
-        if self.simulation.place(joints) and self.is_real:
+        if self._robot.place(joints) and self.is_real:
             links = " and ".join(self.simulation.contacts()[0])
             raise ValueError(f"a real arm cannot be moved to a pose in which {links} would touch")
         self.simulation.move_objects(paths)
-        self.simulation.settle()
+        self._robot.settle()
         return SETTLE_CYCLES
 
     def act(self, action: Sequence[float]) -> None:
@@ -89,7 +87,7 @@ class ArmRobot(ABC, Generic[Simulation]):
 
         Velocities are kept within the scaled limits.
         """
-        mode, sim = self._settings.action_mode, self.simulation
+        mode, sim, robot = self._settings.action_mode, self.simulation, self._robot
         unit = "rad/s" if mode.endswith("_vel") else "rad"
         wire = [sim.JOINTS[index] for index in self.ORDER]
         if len(action) != len(wire):
@@ -97,8 +95,8 @@ class ArmRobot(ABC, Generic[Simulation]):
         for joint, value in zip(wire, action, strict=True):
             if not math.isfinite(value):
                 raise ValueError(f"the action for {joint} is {value:g}: expected a finite number [{unit}]")
-        if sim.stopped_by is not None:
-            raise ValueError(f"the robot has stopped ({sim.stopped_by}): SetState asks at the server's terminal")
+        if robot.stopped_by is not None:
+            raise ValueError(f"the robot has stopped ({robot.stopped_by}): SetState asks at the server's terminal")
         target = np.array([action[index] for index in self.ORDER])
         if mode == "delta_pos":
             target += sim.joint_positions
@@ -107,19 +105,19 @@ class ArmRobot(ABC, Generic[Simulation]):
         if mode.endswith("_vel"):
             sim.drive(np.clip(target, -sim.max_velocity, sim.max_velocity))
             return
-        sim.command(np.clip(target, self.LOW, self.HIGH))
-        sim.advance()
+        robot.command(np.clip(target, self.LOW, self.HIGH))
+        robot.advance()
 
     def idle(self, cycles: int) -> None:
         """Stop the arm in place and let cycles pass."""
-        self.simulation.hold()
+        self._robot.hold()
         for _ in range(cycles):
-            self.simulation.advance()
+            self._robot.advance()
 
     def close(self) -> None:
         """Close the window, and stop a real arm."""
         self.camera.close()
-        self.simulation.close()
+        self._robot.close()
 
     def _target_joints(self, target: RobotState) -> NDArray[np.float64]:
         names = self.POSITION_NAMES

@@ -29,7 +29,7 @@ class PandaRobot(ArmRobot[PandaSimulation]):
             objects=settings.object_names,
             table=settings.table,
         )
-        super().__init__(settings, simulation, PandaArmEnv.START_JOINTS)
+        super().__init__(settings, simulation, simulation, PandaArmEnv.START_JOINTS)
 
     def _names(self) -> dict[str, float]:
         return state_dict(self.simulation, self._settings.rs_mode)

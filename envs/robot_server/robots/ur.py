@@ -10,8 +10,7 @@ from rlservo.envs.robot_server.robot_server_settings import URSettings
 from rlservo.envs.robot_server.robots.arm import ArmRobot
 from rlservo.envs.ur.rs_modes import ROS_ORDER, state_names
 from rlservo.envs.ur.server_state import state_dict
-from rlservo.robots.arm_interface import MUJOCO
-from rlservo.robots.connect_arm import make_arm
+from rlservo.robots.connect_arm import connect_arm
 from rlservo.robots.ur.parameters import JOINTS, POSITION_LIMITS, cycle_of
 from rlservo.robots.ur.simulation import URSimulation
 
@@ -28,27 +27,21 @@ class URRobot(ArmRobot[URSimulation]):
     LOW, HIGH = -np.array(POSITION_LIMITS), np.array(POSITION_LIMITS)
 
     def __init__(self, settings: URSettings) -> None:
-        self._robot = settings.robot
-        simulation = make_arm(
-            settings.robot,
+        simulation = URSimulation(
             settings.ur_model,
-            limits=settings.limits,
-            confirm=settings.confirm,
-            metrics=settings.metrics,
             max_velocity_scale=settings.max_velocity_scale_factor,
             cycle_s=cycle_of(settings.action_cycle_rate),
             objects=settings.object_names,
             table=settings.table,
             tool=settings.ee_frame or "tool0",
         )
-        super().__init__(settings, simulation, INITIAL_JOINTS)
+        robot = connect_arm(
+            settings.robot, simulation, limits=settings.limits, confirm=settings.confirm, metrics=settings.metrics
+        )
+        super().__init__(settings, simulation, robot, INITIAL_JOINTS)
         self._is_turned = settings.reference_frame == "base"
         if self._is_turned:
             self._to_base = np.array([-1.0, -1.0, 1.0])
-
-    @property
-    def is_real(self) -> bool:
-        return self._robot != MUJOCO
 
     def _names(self) -> dict[str, float]:
         return state_dict(self.simulation, self._settings.rs_mode, is_turned=self._is_turned)

@@ -32,6 +32,7 @@ from rlservo.robots.mir100.parameters import (
     WHEEL_SEPARATION,
 )
 from rlservo.robots.mir100.worlds import Pose, find_world
+from rlservo.robots.robot_port import Robot
 
 GRAVITY = 9.81  # [m/s^2]
 SUBSTEPS = round(CYCLE_S / TIMESTEP)
@@ -43,7 +44,7 @@ ANGULAR_INCREMENT = MAX_ANGULAR_ACCELERATION * TIMESTEP  # [rad/s] a substep
 ROOM_VIEW: dict[str, Any] = {"lookat": (0.0, 0.0, 0.0), "distance": 9.5, "azimuth": 180.0, "elevation": -55.0}
 
 
-class Mir100Simulation:
+class Mir100Simulation(Robot):
     """One robot in one world ("empty" or "lab_6x8"), at 100 Hz physics.
 
     `laser_noise` is the standard deviation of a reading [m]; 0 gives exact distances. The noise is drawn from `rng`,
@@ -79,26 +80,6 @@ class Mir100Simulation:
             self.model.actuator_biasprm.copy(),
         )
         self.place((0.0, 0.0, 0.0))
-
-    # -- of a real base's mirror
-
-    stopped_by: str | None = None
-    """Why the base does not move any more, as an episode's final status; a simulated one is never stopped."""
-
-    def robot_info(self) -> dict[str, Any] | None:
-        """Return what a step's info holds of a real robot."""
-        return None
-
-    def limited(self) -> dict[str, int] | None:
-        """Return the number of commands in which each limit of a real base applied."""
-        return None
-
-    def take_over(self) -> None:
-        """Leave the base to a person, or take it back. Raises ValueError: a simulated base cannot be taken over."""
-        raise ValueError("a simulated base cannot be taken over")
-
-    def close(self) -> None:
-        """Free what the base holds; a simulated one holds nothing."""
 
     # -- placing
 

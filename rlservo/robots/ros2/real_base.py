@@ -1,12 +1,9 @@
-"""A real base in place of the simulated MiR100: the environments see it through the scene's model.
-
-The model follows the base's odometry; commands go to the base.
-"""
+"""A real base in place of the simulated MiR100, whose simulation follows the base's odometry."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -21,14 +18,18 @@ from rlservo.robots.real_robot import RealRobot
 from rlservo.robots.ros2.base_driver import AGE_BOUND_S, BaseLimits, BaseState, RosBase
 
 
-# `stopped_by` has one type in both bases.
-class RealMir100(RealRobot[RosBase, BaseState], Mir100Simulation):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """The scene of a real base; `close` stops it."""
-
-    _is_connected = False  # `place` is called by the simulation's constructor
+class RealMir100(RealRobot[RosBase, BaseState]):
+    """A base that drives; `close` stops it."""
 
     def __init__(
-        self, robot: str, *, needs_scan: bool, fastest: tuple[float, float], limits: Mapping[str, Any], confirm: bool
+        self,
+        robot: str,
+        simulation: Mir100Simulation,
+        *,
+        needs_scan: bool,
+        fastest: tuple[float, float],
+        limits: Mapping[str, Any],
+        confirm: bool,
     ) -> None:
         """Connect and wait for every input. Raises RobotError. A policy's fastest command is in m/s and rad/s."""
         if not isinstance(limits, Mapping):
@@ -40,36 +41,30 @@ class RealMir100(RealRobot[RosBase, BaseState], Mir100Simulation):  # pyright: i
 
         linear, angular = fastest
         self._fastest = linear * checked.speed_scale, angular * checked.speed_scale
-        Mir100Simulation.__init__(self, "empty", laser_noise=0.0)
+        self.simulation = simulation
         self._readings: Vector = np.full(BEAM_COUNT, LASER_MAX)
-        RealRobot.__init__(self, connect, Operator(is_asked=confirm), cycle_s=CYCLE_S, age_bound_s=AGE_BOUND_S)
-        self._is_connected = True
+        super().__init__(connect, Operator(is_asked=confirm), cycle_s=CYCLE_S, age_bound_s=AGE_BOUND_S)
         self._look()
 
-    # -- instead of the simulation's
+    # -- of the port
 
-    def place(
-        self, pose: ArrayLike, *, target: ArrayLike | None = None, cubes: Sequence[ArrayLike] | Vector | None = None
-    ) -> bool:
+    def start_towards(self, target: ArrayLike) -> None:
         """Start at the base's position with a new target, after confirmation. Raises RobotError if the base stopped."""
-        if not self._is_connected:
-            return super().place(pose, target=target, cubes=cubes)
         self._recover()
         self.stopped_by = None
         self._look()
-        super().place(self.pose, target=target)
-        (x0, y0, _), (x, y, _), (linear, angular) = self.pose, self.target, self._fastest
+        self.simulation.place(self.simulation.pose, target=target)
+        (x0, y0, _), (x, y, _), (linear, angular) = self.simulation.pose, self.simulation.target, self._fastest
         self.operator.confirm(
             f"the robot will drive from {x0:.2f}, {y0:.2f} to {x:.2f}, {y:.2f} m in its odometry's frame, "
             f"{math.hypot(x - x0, y - y0):.2f} m away, with at most {linear:.2g} m/s and {angular:.2g} rad/s"
         )
         self._begin()
         self._look()
-        return False
 
     def command(self, linear: float, angular: float) -> bool:
         """Replace the velocities [m/s], [rad/s]; return False if they are not used."""
-        super().command(linear, angular)
+        self.simulation.command(linear, angular)
         may_act = self._may_act()
         if may_act:
             self._robot.command(linear, angular)
@@ -80,15 +75,9 @@ class RealMir100(RealRobot[RosBase, BaseState], Mir100Simulation):  # pyright: i
         """All readings [m], (1012,), computed from the base's scans."""
         return self._readings
 
-    @property
-    def is_blocked(self) -> bool:
-        """False: the base looks after itself."""
-        return False
-
     def robot_info(self) -> dict[str, Any]:
         """Return the state, its changes, the applied limits, and what blocks the base."""
-        info = super().robot_info() or {}
-        return info | ({"blocked": why} if (why := self._robot.blocked_by) else {})
+        return super().robot_info() | ({"blocked": why} if (why := self._robot.blocked_by) else {})
 
     @property
     def frame(self) -> str:
@@ -96,18 +85,18 @@ class RealMir100(RealRobot[RosBase, BaseState], Mir100Simulation):  # pyright: i
         return self._robot.frame
 
     def present_pose(self) -> tuple[float, float, float]:
-        """Return the base's newest pose [m], [m], [rad]; the model's is that of the last cycle."""
+        """Return the base's newest pose [m], [m], [rad]; the simulation's is that of the last cycle."""
         return self._robot.state().pose
 
     def unreachable(self, x: float, y: float, *, within: float, time_s: float) -> str:
         """Return why a place [m] cannot be reached to `within` [m] in a time; empty if it may."""
-        clearance, (x0, y0, _) = self._robot.clearance(x, y), self.pose
+        clearance, (x0, y0, _) = self._robot.clearance(x, y), self.simulation.pose
         if clearance + within < self._robot.half_width:
             return f"the scan shows something at the target, {clearance:.2f} m from it"
         distance, most = math.hypot(x - x0, y - y0), self._fastest[0] * time_s + within
         return f"the target is {distance:.1f} m away: an episode covers {most:.1f} m" if distance > most else ""
 
-    # -- the mirror's
+    # -- parts
 
     def _newest(self) -> BaseState:
         return self._robot.state()
@@ -115,8 +104,9 @@ class RealMir100(RealRobot[RosBase, BaseState], Mir100Simulation):  # pyright: i
     def _show(self, state: BaseState) -> None:
         x, y, yaw = state.pose
         linear, angular = state.velocity
-        self.data.qpos[:] = x, y, yaw
-        self.data.qvel[:] = linear * math.cos(yaw), linear * math.sin(yaw), angular
-        mujoco.mj_kinematics(self.model, self.data)
+        data = self.simulation.data
+        data.qpos[:] = x, y, yaw
+        data.qvel[:] = linear * math.cos(yaw), linear * math.sin(yaw), angular
+        mujoco.mj_kinematics(self.simulation.model, data)
         if state.readings is not None:
             self._readings = state.readings

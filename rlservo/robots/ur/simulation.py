@@ -8,16 +8,16 @@ the frame of the arm's base, which stands unrotated: `base_link` of a UR.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rlservo.robots.arm_interface import ArmState, Vector
+from rlservo.robots.arm_interface import Vector
 from rlservo.robots.disturbable import MAX_MODEL_ERROR
+from rlservo.robots.robot_port import Robot
 from rlservo.robots.ur.model import BASE_HEIGHT, TIMESTEP, Table, build_model
 from rlservo.robots.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.robots.ur.parameters import JOINTS, ur_parameters
@@ -56,7 +56,7 @@ class _Limits(Protocol):
     def effort_limits(self) -> tuple[float, ...]: ...
 
 
-class ArmSimulation:
+class ArmSimulation(Robot):
     """One arm and its scene, at 200 Hz physics, or the next higher rate with a whole number of steps per control cycle.
 
     `max_velocity_scale` multiplies the arm's joint velocity limits, as the robot server's parameter of that name.
@@ -83,6 +83,7 @@ class ArmSimulation:
         self.model: mujoco.MjModel = model
         self.data = mujoco.MjData(self.model)
         self._effort_limits = parameters.effort_limits
+        self.velocity_scale, self.cycle_s = max_velocity_scale, cycle_s
         self.max_velocity = max_velocity_scale * np.array(parameters.velocity_limits)  # [rad/s], (joints,)
         self._substeps = math.ceil(cycle_s / TIMESTEP - 1e-9)
         if abs(self._substeps * TIMESTEP - cycle_s) > 1e-9:
@@ -108,33 +109,6 @@ class ArmSimulation:
         self._velocity: Vector = np.zeros(len(self.JOINTS))  # [rad/s], of the trajectory that is being executed
         self._remaining = 0  # substeps until that trajectory arrives
         self.in_collision = False
-
-    # -- of a real arm's mirror
-
-    stopped_by: str | None = None
-    """Reason why the arm has stopped, as an episode's final status; a simulated one never stops."""
-
-    def robot_info(self) -> dict[str, Any] | None:
-        """Return a step's info on a real robot."""
-        return None
-
-    aim: Callable[[Vector], str] | None = None
-    """Chooses a real arm's target before it moves to its start [rad] (joints,), and returns it in words."""
-
-    def unreachable(self, position: Vector, start: Vector, *, within: float, time_s: float) -> str:  # noqa: ARG002
-        """Return why a real arm's tool cannot get to a position in a time; empty if it may."""
-        return ""
-
-    def take_over(self) -> None:
-        """Let a person lead the arm, or give it back. Raises ValueError: a simulated arm cannot be led."""
-        raise ValueError("a simulated arm cannot be led by hand")
-
-    def limited(self) -> dict[str, int] | None:
-        """Return the number of cycles in which each limit of a real arm applied."""
-        return None
-
-    def close(self) -> None:
-        """Free what the arm holds; a simulated one holds nothing."""
 
     # -- placing
 
@@ -217,18 +191,21 @@ class ArmSimulation:
 
     # -- moving
 
-    def command(self, joint_positions: ArrayLike) -> None:
+    def command(self, joint_positions: ArrayLike) -> float:
         """Replace the trajectory: move to `joint_positions` [rad] (joints,), all joints arriving together.
 
         It takes max(0.5 s, the slowest joint's travel at its scaled velocity limit) and starts at the current setpoint.
+        Return how long it takes [s].
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         way = goal - self.data.act
         duration = max(MIN_TRAJECTORY_S, float((np.abs(way) / self.max_velocity).max()))
-        timestep = self.model.opt.timestep
+        timestep = float(self.model.opt.timestep)
         # Whole substeps, rounded up so that no joint exceeds its limit and the last substep ends at the goal.
         self._remaining = max(1, math.ceil(duration / timestep - 1e-9))
-        np.divide(way, self._remaining * timestep, out=self._velocity)
+        duration = self._remaining * timestep
+        np.divide(way, duration, out=self._velocity)
+        return duration
 
     def hold(self) -> None:
         """Stop in place: the robot server does so when a cycle passes without a command."""
@@ -280,13 +257,6 @@ class ArmSimulation:
     def commanded_velocity(self) -> Vector:
         """Joint velocities [rad/s] (joints,) of the trajectory that is being executed; zero once it has arrived."""
         return self._velocity.copy() if self._remaining else np.zeros(len(self.JOINTS))
-
-    def arm_state(self) -> ArmState:
-        """Return the arm of this moment; a simulation's clock is its own."""
-        now = time.monotonic()
-        return ArmState(
-            self.joint_positions.copy(), self.joint_velocities.copy(), self.data.time, now, 0.0, "running", "normal"
-        )
 
     @property
     def joint_positions(self) -> Vector:
@@ -401,7 +371,7 @@ class URSimulation(ArmSimulation):
         table: Table = True,
         tool: str = "tool0",
     ) -> None:
-        self.parameters = ur_parameters(ur_model)
+        self.ur_model, self.parameters = ur_model, ur_parameters(ur_model)
         super().__init__(
             self.parameters,
             build_model(self.parameters, objects=objects, table=table),

@@ -19,6 +19,7 @@ from websockets.sync.client import connect
 
 from foreign_base import NO_TURN, ForeignBase, Scanner, transform
 from rlservo.robots.arm_interface import RobotError
+from rlservo.robots.mir100.simulation import Mir100Simulation
 from rlservo.robots.ros2.base_driver import BaseLimits, RosBase
 from rlservo.robots.ros2.real_base import RealMir100
 
@@ -358,4 +359,7 @@ def test_reason_of_a_fault_is_the_cause_that_is_known(
 )
 def test_limits_of_the_wrong_kind_are_one_sentence(values: Any) -> None:
     with pytest.raises(RobotError, match=r"^limits"):
-        RealMir100("rosbridge://127.0.0.1:1", needs_scan=False, fastest=(0.5, 0.7), limits=values, confirm=False)
+        RealMir100(
+            "rosbridge://127.0.0.1:1", Mir100Simulation(), needs_scan=False, fastest=(0.5, 0.7), limits=values,
+            confirm=False,
+        )  # fmt: skip

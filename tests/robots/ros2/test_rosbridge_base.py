@@ -274,7 +274,7 @@ def test_person_drives_the_base_until_it_is_given_back(base: RunningBase) -> Non
 
         def step() -> str:
             drive(messages.twist(0.3, 0.0))
-            robot.simulation.hold()  # an episode's end, or a late answer of the policy's server
+            robot.robot.hold()  # an episode's end, or a late answer of the policy's server
             return str(env.step(stand)[-1]["robot"]["state"])
 
         robot.take_over()
