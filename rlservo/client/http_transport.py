@@ -19,7 +19,7 @@ import numpy as np
 import orjson
 
 from rlservo.client.formats.addresses import parse_address
-from rlservo.client.formats.http_connection import Connection, NotHttpError, Response, ServerRoute, time_left
+from rlservo.client.formats.http_connection import Connection, NotHttpError, ServerRoute, time_left
 from rlservo.client.formats.request_names import LABEL_HEADER
 from rlservo.client.replies import decode_error, excerpt
 from rlservo.errors import DeadlineError, TooLargeError, UnavailableError, UsageError
@@ -117,19 +117,24 @@ class Transport:
         while True:
             wait: float | None = None
             try:
-                response, _ = self.exchange(method, target, TYPE if body is not None else b"", body, deadline)
+                response = self.exchange(method, target, TYPE if body is not None else b"", body, deadline)
             except BrokenError as error:
                 failure: UnavailableError = error
                 if attempt == 0 and error.was_connected:
                     wait = 0.0  # a server that closed an idle connection is probably still running
             else:
-                if response.status < 300:
-                    return bytes(response.body)
-                refusal = decode_error(self.url + target, response.status, bytes(response.body))
-                if response.status not in RETRIED or not isinstance(refusal, UnavailableError):
+                status, headers, content = response.status, response.headers, bytes(response.body)
+                if response.is_reusable and not self._is_closed:
+                    self._idle.append(response)  # from here on another thread may use it
+                else:
+                    response.close()
+                if status < 300:
+                    return content
+                refusal = decode_error(self.url + target, status, content)
+                if status not in RETRIED or not isinstance(refusal, UnavailableError):
                     raise refusal
                 failure = refusal
-                wait = failure.retry_after_s = _retry_after_s(response)
+                wait = failure.retry_after_s = _retry_after_s(headers)
             # Jitter keeps a fleet of robots from retrying at once.
             backoff_s = min(FIRST_WAIT_S * 2**attempt, LONGEST_WAIT_S) * random.uniform(0.75, 1.25)
             wait_s = backoff_s if wait is None else wait
@@ -141,16 +146,14 @@ class Transport:
                 raise failure
             attempt += 1
 
-    def exchange(
-        self, method: str, target: str, fields: bytes, body: bytes | None, deadline: float
-    ) -> tuple[Response, Connection]:
-        """Return the whole response to one attempt, and its connection. Raises BrokenError and DeadlineError.
+    def exchange(self, method: str, target: str, fields: bytes, body: bytes | None, deadline: float) -> Connection:
+        """Return the connection with the whole response to one attempt, for the caller to close or to use again.
 
-        With status 101 the connection is the caller's, and still to be closed.
+        Raises BrokenError and DeadlineError.
         """
         if self._is_closed:
             raise UsageError("the client is closed: create a new one")
-        budget_s, response = deadline - time.monotonic(), Response()
+        budget_s = deadline - time.monotonic()
         if self.label is not None:
             fields = b"%s%s: %s\r\n" % (fields, LABEL, self.label.encode())
         if (tracing := sys.modules.get("opentelemetry.trace")) is not None:  # only if the caller uses it
@@ -160,21 +163,18 @@ class Transport:
                 fields += parent.encode()
         request = self._route.request(method, self._path + target.encode(), self._fields + fields, body)
         connection = self._connection(deadline, budget_s)
-        is_kept = False
+        is_whole = False
         try:
-            connection.send(request, deadline)
-            while not response.is_complete:
-                connection.receive(response, deadline)
-                if len(response.body) > MAX_REPLY_BYTES:
+            connection.ask(request, deadline)
+            while not connection.is_complete:
+                connection.receive(deadline)
+                if len(connection.body) > MAX_REPLY_BYTES:
                     raise TooLargeError(
                         f"{self.url} sent more than {MAX_REPLY_BYTES >> 20} MiB: is it an rlservo server?"
                     )
             time_left(deadline)
-            is_kept = response.status == 101
-            if response.is_reusable and not self._is_closed:
-                self._idle.append(connection)
-                is_kept = True
-            return response, connection
+            is_whole = True
+            return connection
         except TimeoutError as error:
             raise DeadlineError(f"{self.url} did not answer within {budget_s:.3g} s") from error
         except NotHttpError as error:
@@ -184,7 +184,7 @@ class Transport:
             broken.was_connected = True
             raise broken from error
         finally:
-            if not is_kept:
+            if not is_whole:
                 connection.close()  # a late answer cannot reach the next request
 
     def _connection(self, deadline: float, budget_s: float) -> Connection:
@@ -220,10 +220,10 @@ def _target(path: tuple[str, ...]) -> str:
     return "".join(f"/{quote(part, safe='')}" for part in path)
 
 
-def _retry_after_s(response: Response) -> float | None:
+def _retry_after_s(headers: list[tuple[bytes, bytes]]) -> float | None:
     """Return Retry-After in seconds; None if absent or a date, which our servers do not send."""
     try:
-        seconds = float(dict(response.headers).get(b"retry-after", b""))
+        seconds = float(dict(headers).get(b"retry-after", b""))
     except ValueError:
         return None
     return seconds if seconds >= 0 else None  # also refuses NaN

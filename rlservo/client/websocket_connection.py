@@ -30,8 +30,9 @@ class WebSocket:
         self._protocol = ClientProtocol(parse_uri(f"{url}{path}"), max_size=MAX_REPLY_BYTES)
         offered = self._protocol.connect().headers.raw_items()
         fields = "".join(f"{name}: {value}\r\n" for name, value in offered if name != "Host").encode()
-        response, self._connection = transport.exchange("GET", path, fields, None, deadline)
+        response = self._connection = transport.exchange("GET", path, fields, None, deadline)
         if response.status != 101:
+            response.close()
             raise decode_error(url, response.status, bytes(response.body))
         self._frames: list[Frame] = []  # of an incomplete message
         head = b"".join(b"%s: %s\r\n" % header for header in response.headers)

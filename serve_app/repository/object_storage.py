@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 from urllib.parse import quote, urlsplit
 
-from rlservo.client.formats.http_connection import Connection, Response, ServerRoute
+from rlservo.client.formats.http_connection import Connection, ServerRoute
 from rlservo.errors import BundleError, UnavailableError, UsageError, first_line
 from rlservo.extras import install
 from rlservo.serve_app.repository.places import TIMEOUT_S, place_of
@@ -152,21 +152,20 @@ class ObjectStorage:
         deadline, length, refusal = time.monotonic() + self.timeout_s + len(body or b"") / SLOWEST, 0, b""
         parts, route = urlsplit(url), ServerRoute.to(url, os.environ.get("AWS_CA_BUNDLE"))
         target = f"{parts.path or '/'}{'?' if parts.query else ''}{parts.query}".encode()
-        response = Response()
         with contextlib.closing(Connection(route, min(deadline, time.monotonic() + self.timeout_s))) as connection:
-            connection.send(route.request("GET" if body is None else "PUT", target, fields, body), deadline)
-            while not response.is_complete and len(refusal) < REFUSAL:
-                connection.receive(response, min(deadline + length / SLOWEST, time.monotonic() + self.timeout_s))
-                block, response.body = response.body, bytearray()
+            connection.ask(route.request("GET" if body is None else "PUT", target, fields, body), deadline)
+            while not connection.is_complete and len(refusal) < REFUSAL:
+                connection.receive(min(deadline + length / SLOWEST, time.monotonic() + self.timeout_s))
+                block, connection.body = connection.body, bytearray()
                 length += len(block)
-                if not 200 <= response.status < 300:
+                if not 200 <= connection.status < 300:
                     refusal += block[:REFUSAL]
                 elif length > most:
                     raise BundleError(f"the storage sends more than the {most:,} bytes that it may")
                 else:
                     into.write(block)
-        found = {name.decode("latin-1"): value.decode("latin-1") for name, value in response.headers}
-        return Reply(response.status, found, refusal.decode(errors="replace"))
+        found = {name.decode("latin-1"): value.decode("latin-1") for name, value in connection.headers}
+        return Reply(connection.status, found, refusal.decode(errors="replace"))
 
     def _signed(self, method: str, name: str, given: dict[str, str]) -> str:
         if self.is_read_only:

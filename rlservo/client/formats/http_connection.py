@@ -13,7 +13,9 @@ import select
 import socket
 import ssl
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 from urllib.parse import unquote, urlsplit
 from urllib.request import getproxies, proxy_bypass
 
@@ -25,6 +27,10 @@ from rlservo.errors import UsageError
 READ_BYTES = 65536
 MAX_OVERHEAD = 1 << 17  # [bytes] of a head and trailers, and of a body's framing beyond the body's own length
 TLS_SCHEMES, PORTS = ("https", "wss"), {"http": 80, "ws": 80, "https": 443, "wss": 443}
+WANTED: dict[type[OSError], int] = {ssl.SSLWantReadError: select.POLLIN, ssl.SSLWantWriteError: select.POLLOUT}
+
+Given = TypeVar("Given")
+Done = TypeVar("Done")
 
 
 @dataclass(frozen=True)
@@ -86,25 +92,82 @@ class NotHttpError(ConnectionError):
     """The server sent something that is not an answer in HTTP."""
 
 
-class Response:
-    """A response while it arrives. httptools' parser calls the methods `on_...`."""
+class Connection:
+    """A connection to a server, and the response that arrives on it. After any exception it must be closed.
+
+    httptools' parser calls the methods `on_...`.
+    """
 
     status = 0  # until the head is complete
     is_complete = False
     rest = b""
     """The first bytes of another protocol, with status 101."""
     is_reusable = False
-    """Whether its connection can take another request."""
+    """Whether it can take another request."""
 
-    def __init__(self) -> None:
+    def __init__(self, route: ServerRoute, deadline: float) -> None:
+        """Connect by `deadline` (`time.monotonic`). Raises ConnectionError and TimeoutError, as all methods do."""
+        try:
+            self._socket = socket.create_connection(route.proxy or (route.host, route.port), time_left(deadline))
+        except TimeoutError:
+            raise
+        except OSError as error:
+            raise ConnectionError(str(error)) from error
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.setblocking(False)
+            self._readable = select.poll()
+            self._readable.register(self._socket, select.POLLIN)
+            self._parser = httptools.HttpResponseParser(self)
+            if route.proxy is not None and not route.prefix:
+                self.ask(route.tunnel_request, deadline)
+                while not self.status:
+                    self.receive(deadline)
+                if not 200 <= self.status < 300:
+                    raise ConnectionError(f"the proxy answered {self.status}")
+                self._parser = httptools.HttpResponseParser(self)  # the other would wait for the tunnel's end
+            if route.tls is not None:
+                self._socket.settimeout(time_left(deadline))
+                self._socket = route.tls.wrap_socket(self._socket, server_hostname=route.host)
+                self._socket.setblocking(False)
+        except BaseException as error:
+            self.close()
+            if isinstance(error, OSError) and not isinstance(error, TimeoutError):
+                raise ConnectionError(str(error)) from error
+            raise
+        self.used_at = time.monotonic()
+        """Time of the server's last bytes."""
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether the server has neither closed it nor sent anything that no one asked for."""
+        return not self._readable.poll(0)
+
+    def ask(self, request: bytes, deadline: float) -> None:
+        """Send a request, whose response comes with `receive`."""
+        self.status, self.is_complete, self.is_reusable = 0, False, False
         self.headers: list[tuple[bytes, bytes]] = []
         self.body = bytearray()
-        self._parser = httptools.HttpResponseParser(self)
         self._overhead = 0  # bytes that were not of the body
+        self.send(request, deadline)
 
-    def feed(self, data: bytes) -> None:
-        """Take the connection's next bytes; none at its end. Raises ConnectionError."""
-        before = len(self.body)
+    def send(self, content: bytes, deadline: float) -> None:
+        """Send all of `content`."""
+        rest = memoryview(content)
+        while rest:
+            time_left(deadline)
+            rest = rest[self._do(self._socket.send, rest, select.POLLOUT, deadline) :]
+
+    def read(self, deadline: float) -> bytes:
+        """Return the next bytes; none at the connection's end."""
+        _wait(self._readable, deadline)
+        data = self._do(self._socket.recv, READ_BYTES, select.POLLIN, deadline)
+        self.used_at = time.monotonic()
+        return data
+
+    def receive(self, deadline: float) -> None:
+        """Read the next bytes of a response; none come at the connection's end."""
+        data, before = self.read(deadline), len(self.body)
         try:
             self._parser.feed_data(data)
         except httptools.HttpParserUpgrade as switch:
@@ -121,6 +184,10 @@ class Response:
             if not self.status or has_length:
                 raise ConnectionError("the server closed it before the answer was complete")
             self.is_complete = True
+
+    def close(self) -> None:
+        """Close it."""
+        self._socket.close()
 
     def on_header(self, name: bytes, value: bytes) -> None:
         if not self.status:  # later ones are trailers
@@ -145,76 +212,22 @@ class Response:
             self.is_complete = True
             self.is_reusable = self.status != 101 and self._parser.should_keep_alive()
 
-
-class Connection:
-    """A connection to a server. After any exception it must be closed."""
-
-    def __init__(self, route: ServerRoute, deadline: float) -> None:
-        """Connect by `deadline` (`time.monotonic`). Raises ConnectionError and TimeoutError, as all methods do."""
-        try:
-            self._socket = socket.create_connection(route.proxy or (route.host, route.port), time_left(deadline))
-        except TimeoutError:
-            raise
-        except OSError as error:
-            raise ConnectionError(str(error)) from error
-        try:
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if route.proxy is not None and not route.prefix:
-                self.send(route.tunnel_request, deadline)
-                answer = Response()
-                while not answer.status:
-                    self.receive(answer, deadline)
-                if not 200 <= answer.status < 300:
-                    raise ConnectionError(f"the proxy answered {answer.status}")
-            if route.tls is not None:
-                self._socket.settimeout(time_left(deadline))
-                self._socket = route.tls.wrap_socket(self._socket, server_hostname=route.host)
-        except BaseException as error:
-            self.close()
-            if isinstance(error, OSError) and not isinstance(error, TimeoutError):
+    def _do(self, operation: Callable[[Given], Done], given: Given, events: int, deadline: float) -> Done:
+        """Return a socket operation's result; `events` are what it waits for, unless TLS wants the other direction."""
+        while True:
+            try:
+                return operation(given)
+            except (BlockingIOError, ssl.SSLWantReadError, ssl.SSLWantWriteError) as error:
+                ready = select.poll()
+                ready.register(self._socket, WANTED.get(type(error), events))
+                _wait(ready, deadline)
+            except OSError as error:
                 raise ConnectionError(str(error)) from error
-            raise
-        self._readable = select.poll()
-        self._readable.register(self._socket, select.POLLIN)
-        self.used_at = time.monotonic()
-        """Time of the server's last bytes."""
 
-    @property
-    def is_quiet(self) -> bool:
-        """Whether the server has neither closed it nor sent anything that no one asked for."""
-        return not self._readable.poll(0)
 
-    def send(self, content: bytes, deadline: float) -> None:
-        """Send all of `content`. The time-out of `sendall` over TLS begins again with each piece."""
-        rest = memoryview(content)
-        try:
-            while rest:
-                self._socket.settimeout(time_left(deadline))
-                rest = rest[self._socket.send(rest) :]
-        except TimeoutError:
-            raise
-        except OSError as error:
-            raise ConnectionError(str(error)) from error
-
-    def read(self, deadline: float) -> bytes:
-        """Return the next bytes; none at the connection's end."""
-        self._socket.settimeout(time_left(deadline))
-        try:
-            data = self._socket.recv(READ_BYTES)
-        except TimeoutError:
-            raise
-        except OSError as error:
-            raise ConnectionError(str(error)) from error
-        self.used_at = time.monotonic()
-        return data
-
-    def receive(self, response: Response, deadline: float) -> None:
-        """Read the next bytes of a response."""
-        response.feed(self.read(deadline))
-
-    def close(self) -> None:
-        """Close it."""
-        self._socket.close()
+def _wait(ready: select.poll, deadline: float) -> None:
+    if not ready.poll(1e3 * time_left(deadline)):
+        raise TimeoutError("the deadline has passed")
 
 
 def time_left(deadline: float) -> float:
