@@ -6,18 +6,18 @@ Gymnasium's vector environments give it; for a Dict, a list of single observatio
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from rlservo.bundle.spaces import DictSpec, SpaceSpec, TupleSpec
+from rlservo.bundle.spaces import LeafSpec, SpaceSpec
 from rlservo.errors import RequestError
 
 
 def build_action(space: SpaceSpec, leaves: Mapping[str, Any], path: str = "action") -> Any:
     """Return the action in the space's own form: dicts and tuples of its leaves, which come by tensor name."""
-    if isinstance(space, DictSpec):
+    if space.kind == "dict":
         return {key: build_action(child, leaves, f"{path}.{key}") for key, child in space.spaces.items()}
-    if isinstance(space, TupleSpec):
+    if space.kind == "tuple":
         return tuple(build_action(child, leaves, f"{path}.{index}") for index, child in enumerate(space.spaces))
     return leaves[path]
 
@@ -27,14 +27,24 @@ def action_leaves(space: SpaceSpec, action: Any, path: str = "action") -> dict[s
 
     Raises RequestError if it is not of the space's form.
     """
-    if isinstance(space, DictSpec):
+    leaves: dict[str, Any] = {}
+    convert_leaves(space, action, lambda _spec, leaf, name: leaves.update({name: leaf}), path)
+    return leaves
+
+
+def convert_leaves(
+    space: SpaceSpec, action: Any, convert: Callable[[LeafSpec, Any, str], Any], path: str = "action"
+) -> Any:
+    """Return an action in the space's own form, with `convert` of each leaf's spec, value and tensor name.
+
+    Raises RequestError if it is not of the space's form.
+    """
+    if space.kind == "dict":
         if not isinstance(action, Mapping) or set(action) != set(space.spaces):
             raise RequestError(f"{path} must be a map with the keys {', '.join(sorted(space.spaces))}")
-        parts = [action_leaves(child, action[key], f"{path}.{key}") for key, child in space.spaces.items()]
-    elif isinstance(space, TupleSpec):
+        return {key: convert_leaves(each, action[key], convert, f"{path}.{key}") for key, each in space.spaces.items()}
+    if space.kind == "tuple":
         if not isinstance(action, list | tuple) or len(action) != len(space.spaces):
             raise RequestError(f"{path} must be a list of {len(space.spaces)} parts")
-        parts = [action_leaves(child, action[i], f"{path}.{i}") for i, child in enumerate(space.spaces)]
-    else:
-        return {path: action}
-    return {name: leaf for part in parts for name, leaf in part.items()}
+        return tuple(convert_leaves(each, action[i], convert, f"{path}.{i}") for i, each in enumerate(space.spaces))
+    return convert(space, action, path)

@@ -180,9 +180,9 @@ SpaceSpec = Annotated[
 
 def leaf_specs(space: SpaceSpec, name: str) -> dict[str, LeafSpec]:
     """Return every leaf of a space by tensor name, `name` or `name.<path>`: Dict keys sorted, as RLlib has them."""
-    if isinstance(space, DictSpec):
+    if space.kind == "dict":  # `isinstance` with a pydantic class runs Python code, once per request
         inside = {key: space.spaces[key] for key in sorted(space.spaces)}
-    elif isinstance(space, TupleSpec):
+    elif space.kind == "tuple":
         inside = {str(index): child for index, child in enumerate(space.spaces)}
     else:
         return {name: space}

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import orjson
+from numpy.typing import NDArray
 
 from rlservo import errors
 from rlservo.bundle.compatibility import interface_differences
 from rlservo.bundle.contract import Contract
-from rlservo.bundle.nested import action_leaves, build_action
-from rlservo.bundle.spaces import leaf_specs
+from rlservo.bundle.nested import convert_leaves
+from rlservo.bundle.spaces import LeafSpec
 from rlservo.client.formats.request_names import MARK
 from rlservo.errors import (
     ActionError,
@@ -145,26 +147,37 @@ def is_action(action: Any, batch: tuple[int, ...], contract: Contract) -> bool:
 
 
 def _decode(action: Any, batch: tuple[int, ...], chunk: tuple[int, ...], contract: Contract) -> Any:
-    space, decoded = contract.action_space, {}
-    try:
-        leaves = action_leaves(space, action)
-    except RequestError as error:
-        raise ActionError(f"the server's action for {contract.name!r} cannot be read: {error}") from error
-    for name, spec in leaf_specs(space, "action").items():
-        what = f"the server's {name} for {contract.name!r}"
-        leaf, shape = leaves[name], (*batch, *chunk, *spec.shape)
+    def convert(spec: LeafSpec, leaf: Any, name: str) -> NDArray[Any]:
         try:
             array = np.asarray(leaf)
         except ValueError:  # ragged
             array = np.asarray(None)
+        converted, shape, fault = array, (*batch, *chunk, *spec.shape), ""
         if array.dtype.kind not in "fiu" and array.size:
-            raise ActionError(f"{what} is {str(leaf)[:80]}, expected numbers")
-        if array.shape != shape:
-            raise ActionError(f"{what} has shape {array.shape}, expected {shape}")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ActionError(f"{what} has an element that is not finite")
-        converted = array.astype(spec.dtype)
-        if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
-            raise ActionError(f"{what} is {str(leaf)[:80]}, expected {spec.dtype}")
-        decoded[name] = converted.reshape((*batch, *spec.shape))
-    return build_action(space, decoded)
+            fault = f"is {str(leaf)[:80]}, expected numbers"
+        elif array.shape != shape:
+            fault = f"has shape {array.shape}, expected {shape}"
+        elif not is_finite(array):
+            fault = "has an element that is not finite"
+        else:
+            converted = array.astype(spec.dtype)
+            if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
+                fault = f"is {str(leaf)[:80]}, expected {spec.dtype}"
+        if fault:
+            raise ActionError(f"the server's {name} for {contract.name!r} {fault}")
+        return converted.reshape((*batch, *spec.shape)) if chunk else converted
+
+    try:
+        return convert_leaves(contract.action_space, action, convert)
+    except RequestError as error:
+        raise ActionError(f"the server's action for {contract.name!r} cannot be read: {error}") from error
+
+
+def is_finite(array: NDArray[Any]) -> bool:
+    """Return whether all elements are finite: a not-a-number counts as the largest and as the smallest.
+
+    `np.isfinite(array).all()` is slower by 20 microseconds once the processor's caches hold something else.
+    """
+    if array.dtype.kind != "f" or not array.size:
+        return True
+    return math.isfinite(array.item(array.argmax())) and math.isfinite(array.item(array.argmin()))
