@@ -18,7 +18,7 @@ from rlservo.policy.acting_policy import Observation
 def encode_observation(obs: Observation, contract: Contract) -> tuple[Any, tuple[int, ...]]:
     """Return (encoded observation, batch axis as () or (B,)); the server checks shapes and names."""
     space = contract.observation_space
-    if space.kind != "dict" and isinstance(obs, Mapping):  # element names and values
+    if not isinstance(obs, np.ndarray) and space.kind != "dict" and isinstance(obs, Mapping):  # by element name
         elements = {str(name): _finite_array(value, f"element {name!r}") for name, value in obs.items()}
         return elements, next((value.shape[:1] for value in elements.values()), ())
     return _encode_part(obs, space, "")
