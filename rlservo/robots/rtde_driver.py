@@ -15,6 +15,7 @@ from rlservo.robots.rtde_probe import no_answer
 from rlservo.robots.ur.parameters import CB3, UR_PARAMETERS, model_of, rate_hz_of
 
 FIRST_STATE_S = 5.0
+SLOW_CALL_S = 0.3  # [s] for one command; beyond it, ur_rtde has lost the program or connected again
 IS_PROGRAM_RUNNING = 2  # bit of the robot's status
 PAUSING, PAUSED = 3, 4  # runtime_state
 LINK_S = 0.03  # [s], for a command to reach the controller and its state to come back, over a cable
@@ -82,8 +83,9 @@ class RtdeDriver:
 
     def send(self, setpoint: Vector) -> bool:
         """Command the next joint positions [rad] (6,); return whether the controller takes them."""
+        began = time.monotonic()
         taken: bool = self._control.servoJ(setpoint.tolist(), 0.0, 0.0, 1.0 / self.rate_hz, *self._servo)
-        return taken
+        return taken and time.monotonic() - began <= SLOW_CALL_S
 
     def hand_over(self, *, to_person: bool) -> None:
         """Let a person lead the arm, or hold it again where it is."""

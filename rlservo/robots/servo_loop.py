@@ -31,7 +31,6 @@ from rlservo.robots.ur.simulation import URSimulation
 
 READY, FAILED = "ready", "failed: "  # lines on standard output; a fault after READY is also FAILED
 LOST_S = 1.0  # [s] without a package, after which the connection counts as lost
-SLOW_CALL_S = 0.3  # [s] for one command; beyond it, the driver has lost the program or connected again
 AGE_BOUND_S = 0.1  # [s] oldest state that may be acted on
 SCALE_RISE = 1.0  # [1/s], at which the speed follows a scaling that rises
 ZERO_S = 0.2  # [s] of a speed scaling that is no motion, until it is a stop
@@ -177,8 +176,7 @@ class ServoLoop:
             return
         setpoint = self._limiter.step(want, dt, scale)
         began = time.monotonic()
-        is_taken = self._robot.send(setpoint)
-        if not is_taken or time.monotonic() - began > SLOW_CALL_S:
+        if not self._robot.send(setpoint):
             while time.monotonic() < began + REASON_S:  # its cause comes by another connection
                 self._look(time.monotonic())
                 self._check()

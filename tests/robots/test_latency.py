@@ -17,16 +17,19 @@ from rlservo.robots.limits import Limits
 
 pytest.importorskip("rtde_control")
 
+# Each way. ur_rtde takes a command for refused after 0.3 s, so 0.2 s are left to a busy machine.
+LINK_S = 0.05
+
 
 def test_latency_is_the_links_and_the_followers_and_gives_the_evaluation_to_pass(arm: RunningArm) -> None:
-    arm.server.link.latency_s = 0.1
+    arm.server.link.latency_s = LINK_S
     real = ArmProcess(arm.host, "ur5", setpoint_timeout_s=0.5, limits=Limits(watchdog_hz=1.0))
     try:
         report = measure_latency(real, steps=5)
     finally:
         real.close()
-    assert report.p50_ms >= 200.0  # there and back
-    assert report.cycles >= 3
+    assert report.p50_ms >= 2000.0 * LINK_S  # there and back
+    assert report.cycles >= 2
     assert report.disturbance == f"latency={report.cycles},noise=real"
     assert report.state_period_ms >= 7.9
     assert abs(arm.controller.simulation.joint_positions[5]) < 0.02
@@ -74,14 +77,14 @@ def test_robot_that_stops_between_two_motions_says_why(arm: RunningArm) -> None:
 
 
 def test_arm_whose_slider_is_at_a_tenth_is_measured_too(arm: RunningArm) -> None:
-    arm.server.link.latency_s = 0.1
+    arm.server.link.latency_s = LINK_S
     arm.do(lambda: setattr(arm.controller, "speed_fraction", 0.1))
     real = ArmProcess(arm.host, "ur5", setpoint_timeout_s=0.5, limits=Limits(watchdog_hz=1.0))
     try:
         report = measure_latency(real, steps=5)
     finally:
         real.close()
-    assert 200.0 <= report.p50_ms <= 400.0  # as at full speed
+    assert 2000.0 * LINK_S <= report.p50_ms <= 2000.0 * LINK_S + 200.0  # as at full speed
 
 
 def test_periods_are_those_between_two_setpoints_and_suspensions_are_among_them(arm: RunningArm) -> None:

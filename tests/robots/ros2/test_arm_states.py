@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -290,6 +291,33 @@ def ended(values: dict[str, Any]) -> None:
 def test_reason_of_a_fault_is_the_cause_that_is_known(
     driver: Driver, error: Callable[[dict[str, Any]], None], reason: str
 ) -> None:
+    with streaming(driver) as stream:
+        timer = threading.Timer(0.3, error, [driver.values["joint_states"]])
+        timer.start()
+        with pytest.raises(RobotError, match=f"^{reason}"):
+            stream.run(lambda: None)
+        timer.join()
+
+
+def test_publishing_that_a_busy_machine_holds_up_is_no_fault(driver: Driver, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A publisher gets no answer that could be late; the arm stands at its last setpoint, as if we were suspended."""
+
+    def publish(message: Mapping[str, Any]) -> None:
+        driver.sent.append(message)
+        if len(driver.sent) == 20:
+            time.sleep(0.4)
+        if len(driver.sent) == 60:
+            stream.is_asked_to_end.set()
+
+    monkeypatch.setattr(driver, "advertise", lambda *_: publish)
+    with streaming(driver) as stream:
+        stream.run(lambda: None)
+    assert len(driver.sent) >= 60
+
+
+@contextmanager
+def streaming(driver: Driver) -> Iterator[ServoLoop]:
+    """A command stream, while the driver publishes its joint states."""
     states = driver.values["joint_states"]
     settings = replace(SETTINGS, orders_descriptor=make_file(ORDERS), report_descriptor=make_file(REPORT))
     stream = ServoLoop(settings, RosArmConnection(settings), URSimulation("ur5", objects=()))
@@ -303,15 +331,11 @@ def test_reason_of_a_fault_is_the_cause_that_is_known(
 
     publishing = threading.Thread(target=publish)
     publishing.start()
-    timer = threading.Timer(0.3, error, [states])
-    timer.start()
     try:
-        with pytest.raises(RobotError, match=f"^{reason}"):
-            stream.run(lambda: None)
+        yield stream
     finally:
         is_over.set()
         publishing.join()
-        timer.join()
         for descriptor in (settings.orders_descriptor, settings.report_descriptor):
             os.close(descriptor)
 
