@@ -112,7 +112,7 @@ class CheckpointFiles:
         early = weights_pickle(self.module).name == OLD_WEIGHTS
         if (early or not self.has_pipelines) and not self.alone:
             found.add(self.root / CTOR_FILE)  # the configuration they are built from
-        if self.has_own_connectors and (self.root / CTOR_FILE).is_file():
+        if (self.has_own_connectors or self._has_own([self.module])) and (self.root / CTOR_FILE).is_file():
             found.add(self.root / CTOR_FILE)  # RLlib often records their arguments wrongly, and restores by it
         if self.is_one_of_several and self.together.is_file():
             found.add(self.together)
@@ -121,7 +121,10 @@ class CheckpointFiles:
     @property
     def has_own_connectors(self) -> bool:
         """Whether any code in the connector pipelines is the user's own."""
-        pickles = [folder / CTOR_FILE for folder in (self.env_to_module, self.module_to_env)]
+        return self._has_own([self.env_to_module, self.module_to_env])
+
+    def _has_own(self, folders: list[Path]) -> bool:
+        pickles = [folder / CTOR_FILE for folder in folders]
         named = {module for file in pickles if file.is_file() for module in modules_named(file)}
         return not all(f"{module}.".startswith(LIBRARIES) for module in named)
 

@@ -17,6 +17,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 from ray.rllib.connectors.common.numpy_to_tensor import NumpyToTensor
 from ray.rllib.connectors.env_to_module.mean_std_filter import MeanStdFilter
+from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
 
 from rlservo.errors import CheckpointError, UnsupportedError, first_line
@@ -148,6 +149,22 @@ def restore_pipelines(files: CheckpointFiles, config: Any, folder: Path, spaces:
         except Exception as error:  # the user's own set_state may raise anything
             raise CheckpointError(f"{folder / name} cannot be restored: {explain(error)}") from error
     return pipelines
+
+
+def build_actor(config: Any, module: Any, module_id: str | None, env_to_module: Any) -> Any | None:
+    """Return the module as RLlib's env runners build it from the configuration (`make_module`), without weights.
+
+    `module` is the one that was saved, `module_id` its id if there are several. None for a module that was added in
+    training, of which the configuration knows nothing.
+    """
+    observations = env_to_module.observation_space
+    if module_id is None:
+        single = {DEFAULT_MODULE_ID: (observations, env_to_module.input_action_space)}
+        return config.get_rl_module_spec(spaces=single, inference_only=True).build()
+    spaces = dict.fromkeys(config.policies, (module.observation_space, module.action_space))  # some serve no agent
+    spaces |= {one: (space, env_to_module.action_space[one]) for one, space in observations.spaces.items()}
+    specs = config.get_multi_rl_module_spec(spaces=spaces, inference_only=True).rl_module_specs
+    return specs[module_id].build() if module_id in specs else None
 
 
 def freeze(pipeline: Any) -> None:

@@ -113,6 +113,7 @@ def configurations() -> dict[str, Any]:
     return {
         "asymmetric": ppo("privileged", "box", module=zoo_reported.Asymmetric),
         "trains_otherwise": ppo("vector", "discrete", module=zoo_reported.TrainsOtherwise),
+        "takes_its_argument": ppo("vector", "discrete", module=zoo_reported.TakesItsArgument),
         "critic_in_training": ppo("vector", "discrete", module=zoo_reported.NeedsItsCritic),
         "partly_read": ppo("partly_read", "discrete", module=zoo_reported.PartReader),
         "removed_key": ppo("privileged", "box", without_critic),

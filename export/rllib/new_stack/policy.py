@@ -53,6 +53,7 @@ from rlservo.export.recipe.trees import (
 )
 from rlservo.export.rllib import private_names
 from rlservo.export.rllib.configuration import (
+    build_actor,
     check_own_code,
     folder_of_connectors,
     freeze,
@@ -61,7 +62,7 @@ from rlservo.export.rllib.configuration import (
 )
 from rlservo.export.rllib.distribution_mode import distribution_kind, find_mode
 from rlservo.export.rllib.gaussian_heads import replace_heads
-from rlservo.export.rllib.new_stack.connectors import read_action_steps, read_observation_steps
+from rlservo.export.rllib.new_stack.connectors import SINGLE_AGENT, read_action_steps, read_observation_steps
 from rlservo.export.rllib.new_stack.older_components import (
     CONSTANT,
     is_older,
@@ -253,7 +254,8 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     no_value = _check_weights(files, module)
     module.eval().requires_grad_(False)
     # The gate's own connectors, by RLlib's own way: an error of the recipe must not be in both.
-    own, how = _reference_pipelines(files, (env_to_module, module_to_env), module, notify)
+    config = read_algorithm_config(files)
+    own, how = _reference_pipelines(files, config, (env_to_module, module_to_env), module, notify)
     slot = find_agent_slot(files, module, env_to_module, module_to_env)
     observation_space = slot.part(env_to_module.input_observation_space)
     action_space: Any = slot.part(module_to_env.input_action_space) or module.action_space
@@ -265,13 +267,14 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     # The output of the module's forward pass decides the rule, and running it takes observations.
     draft = Recipe(observation_space, action_space, steps, "argmax", transform, None, state, action_steps)
     forward = _forward_once(pipelines, draft)
-    actor = _actor(files, module, notify)
+    build = partial(build_actor, config, module, None if slot is SINGLE_AGENT else slot.module, own[0])
+    actor = _actor(files, module, build if config is not None else lambda: None, notify)
     acting = pipelines_of(slot, actor, env_to_module, module_to_env, observation_space, action_space)
     is_repeatable = _acts_alike(forward, _forward_once(pipelines, draft))  # else the gate says so
     if is_repeatable and not _acts_alike(forward, _forward_once(acting, draft)):
         raise UnsupportedError(
-            f"module {name} acts differently when it is built for inference only, as RLlib's actors build it: make "
-            "both act the same"
+            f"module {name} acts differently when it is built for inference only, from the algorithm's configuration, "
+            "as RLlib's actors build it: make both act the same, and change none of its arguments (model_config.pop)"
         )
     distribution, mode, names = _action_rule(module, forward, action_space, notify)
     recipe = dataclasses.replace(draft, mode=mode, distribution=distribution)
@@ -311,13 +314,12 @@ def _check_agents(files: CheckpointFiles, pipelines: Any, start_loop: Callable[[
 
 
 def _reference_pipelines(
-    files: CheckpointFiles, listed: tuple[Any, Any], module: Any, notify: Callable[[str], None]
+    files: CheckpointFiles, config: Any, listed: tuple[Any, Any], module: Any, notify: Callable[[str], None]
 ) -> tuple[tuple[Any, Any], str]:
     """Return (pipelines of the parity gate's reference, what they are if not what RLlib itself would restore).
 
     `listed` are those that the recipe is read from. Raises UnsupportedError if they are not the configuration's.
     """
-    config = read_algorithm_config(files)
     if not files.has_pipelines:
         return listed, ALONE if config is None else ""
     if config is not None:
@@ -359,17 +361,19 @@ def _read_pipelines(
     return pipelines
 
 
-def _actor(files: CheckpointFiles, module: Any, notify: Callable[[str], None]) -> Any:
-    """Return the module as RLlib's actors build it, for inference only.
+def _actor(files: CheckpointFiles, module: Any, build: Callable[[], Any | None], notify: Callable[[str], None]) -> Any:
+    """Return the module as RLlib's actors build it: for inference only, and from the configuration, as `build` does.
 
-    It gets all weights: a critic's memory, which it may have, is compared too.
+    RLlib saves a module's arguments as it finds them in its attributes, and does not restore by them. The actor gets
+    all weights: a critic's memory, which it may have, is compared too.
     """
-    if files.alone or module.inference_only or is_older(files.module):
+    if files.alone or is_older(files.module):
         return module
     try:
         with torch.random.fork_rng():
-            args, given = module.get_ctor_args_and_kwargs()
-            actor = type(module)(*args, **{**given, "inference_only": True})
+            if (actor := build()) is None:
+                args, given = module.get_ctor_args_and_kwargs()
+                actor = type(module)(*args, **{**given, "inference_only": True})
         actor.set_state(module.get_state())
     except Exception as error:  # the user's own constructor and state may raise anything
         notify(

@@ -18,6 +18,7 @@ from rlservo.bundle.spaces import DictSpec
 from rlservo.errors import CheckpointError, ObservationError, UnsupportedError
 from rlservo.export.checkpoints.unpickle import unpickle
 from rlservo.export.export_checkpoint import ExportResult, export_all_modules, export_checkpoint
+from rlservo.export.prune_checkpoint import prune_checkpoint
 from rlservo.export.recipe.recipe import Recipe, StateLeaf
 from rlservo.export.recipe.samples import draw_batches
 from rlservo.export.verify_bundle import verify_bundle
@@ -68,9 +69,17 @@ def test_the_export_acts_as_rllib_did(reported_zoo: Path, export: Callable[..., 
     assert_acts_as_recorded(export(name, value=name != "asymmetric"), reported_zoo / f"{name}.npz")
 
 
-def test_a_module_that_acts_otherwise_in_rllibs_actors_is_refused(export: Callable[..., ExportResult]) -> None:
-    with pytest.raises(UnsupportedError, match="TrainsOtherwise acts differently when it is built for inference only"):
-        export("trains_otherwise")
+@pytest.mark.parametrize(("name", "kind"), [
+    ("trains_otherwise", "TrainsOtherwise"), ("takes_its_argument", "TakesItsArgument"),
+])  # fmt: skip
+def test_a_module_that_acts_otherwise_in_rllibs_actors_is_refused(
+    reported_zoo: Path, app: Path, tmp_path: Path, export: Callable[..., ExportResult], name: str, kind: str
+) -> None:
+    with pytest.raises(UnsupportedError, match=f"{kind} acts differently when it is built for inference only, from"):
+        export(name)
+    prune_checkpoint(reported_zoo / name, tmp_path / "pruned", app_dir=app, notify=lambda _: None)
+    with pytest.raises(UnsupportedError, match=f"{kind} acts differently"):
+        export_checkpoint(tmp_path / "pruned", tmp_path / "out", name="arm", app_dir=app, notify=lambda _: None)
 
 
 def test_a_network_that_reads_parts_in_their_order_is_given_rllibs(

@@ -102,6 +102,17 @@ class NeedsItsCritic(TrainsOtherwise):
         return {Columns.ACTION_DIST_INPUTS: self.policy(batch[Columns.OBS])}
 
 
+class TakesItsArgument(TrainsOtherwise):
+    """Takes an argument out of its dict, where RLlib looks for it when it saves."""
+
+    def setup(self) -> None:
+        super().setup()
+        self.gain = 1.0 if self.model_config.pop("vf_share_layers", None) is None else 3.0
+
+    def _forward(self, batch: dict[str, Any], **kwargs: Any) -> dict[str, Any]:
+        return {Columns.ACTION_DIST_INPUTS: torch.sin(self.gain * self.policy(batch[Columns.OBS]))}
+
+
 class PartReader(TorchRLModule, ValueFunctionAPI):
     """Reads one part of a Dict and one of a Tuple."""
 
