@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "app"), str(HERE)]
 import zoo_reported  # noqa: E402  # pyright: ignore[reportMissingImports]  # in app/, added to the path above
 import zoo_team  # noqa: E402  # pyright: ignore[reportMissingImports]
-from train_wide_zoo import SMALL, pieces, team_rollout  # noqa: E402  # pyright: ignore[reportMissingImports]
+from train_wide_zoo import SMALL, pieces, team, team_rollout  # noqa: E402  # pyright: ignore[reportMissingImports]
 from train_zoo import ray_for_training, record  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 IMAGE_LSTM = DefaultModelConfig(
@@ -129,6 +129,7 @@ def configurations() -> dict[str, Any]:
         "main_connector": ppo("vector", "box", TenTimes),
         "external": external(),
         "self_play": self_play(),
+        "sees_the_base_team": team(zoo_reported.SeesTheBase),
     }
 
 
@@ -146,7 +147,7 @@ def main(out: Path, only: list[str]) -> None:
             if name == "self_play":
                 add_snapshot(algorithm)
             algorithm.save_to_path(str(out / name))
-            if name.startswith(("self_play", "out_of_order")):
+            if name.startswith(("self_play", "out_of_order", "sees_the_base")):
                 for agent, seen in team_rollout(algorithm.env_runner).items():
                     np.savez(out / f"{name}_{agent}.npz", **seen)
             elif name != "external":

@@ -19,6 +19,7 @@ from gymnasium.spaces import Space
 from ray.rllib.connectors.connector_pipeline_v2 import ConnectorPipelineV2
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModule
+from ray.rllib.core.rl_module.torch import TorchRLModule
 from ray.rllib.env.multi_agent_episode import MultiAgentEpisode
 from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 
@@ -33,6 +34,7 @@ from rlservo.export.rllib.new_stack.connectors import SINGLE_AGENT, AgentSlot, c
 from rlservo.export.rllib.new_stack.watched import Watched, watch
 
 MAPPING = "AgentToModuleMapping"
+COMPANY = 8  # other agents that act beside the exported one's
 
 
 class NoInfo(dict[str, Any]):
@@ -133,6 +135,24 @@ class MultiAgentPipelines(Pipelines):
     """The same among several agents; only the slot's agent acts."""
 
     slot: AgentSlot
+    company: tuple[Any, ...] = ()
+    """Other agents, which act beside the slot's, each at random and for a module of its own."""
+
+    def in_company(self) -> MultiAgentPipelines:
+        """Return the same with some of the environment's other agents acting too."""
+        spaces: Any = self.env_to_module.input_observation_space
+        others = [agent for agent in spaces.spaces if agent != self.slot.agent][:COMPANY]
+        among = dataclasses.replace(self, company=tuple(others), connector_module=MultiRLModule())
+        among.connector_module.add_module(self.slot.module, self.module)
+        for agent in others:
+            spaces[agent].seed(0)
+            other = TorchRLModule(observation_space=spaces[agent], model_config={})
+            among.connector_module.add_module(among._module_of(agent), other)
+        return among
+
+    def _module_of(self, agent: Any) -> str:
+        module = self.slot.module  # instead of the mapping: the slot's module is already known
+        return module if agent == self.slot.agent else f"{module}_{self.company.index(agent)}"
 
     def to_module(self, episodes: list[Any], shared: dict[str, Any], **last: Any) -> dict[str, Any]:
         """Return the module's batch."""
@@ -153,25 +173,29 @@ class MultiAgentPipelines(Pipelines):
 
     def begin(self, obs: Any) -> Any:
         """Return an episode that has just been reset."""
-        module = self.slot.module  # instead of the mapping: the slot's module is already known
         episode = MultiAgentEpisode(
             observation_space=self.env_to_module.input_observation_space,
             action_space=self.env_to_module.input_action_space,
-            agent_to_module_mapping_fn=lambda _agent, _episode: module,
+            agent_to_module_mapping_fn=lambda agent, _episode: self._module_of(agent),
         )
-        episode.add_env_reset(observations={self.slot.agent: obs}, infos={self.slot.agent: NoInfo()})
+        observations = {self.slot.agent: obs, **self._drawn(episode.observation_space)}
+        episode.add_env_reset(observations=observations, infos={agent: NoInfo() for agent in observations})
         return watch(episode) if self.has_own else episode
 
     def advance(self, episode: Any, obs: Any, action: Any, reward: float, extra: dict[str, Any]) -> None:
         """Add a step to an episode."""
         agent = self.slot.agent
+        observations = {agent: obs, **self._drawn(episode.observation_space)}
         episode.add_env_step(
-            observations={agent: obs},
-            actions={agent: action},
-            rewards={agent: reward},
-            infos={agent: NoInfo()},
+            observations=observations,
+            actions={agent: action, **self._drawn(episode.action_space)},
+            rewards={agent: reward, **dict.fromkeys(self.company, 0.0)},
+            infos={agent: NoInfo() for agent in observations},
             extra_model_outputs={agent: extra},
         )
+
+    def _drawn(self, spaces: Any) -> dict[Any, Any]:
+        return {agent: spaces[agent].sample() for agent in self.company}
 
     def column(self, values: list[Any]) -> list[Any]:
         """Return one value for each environment in the form that an environment gives it."""

@@ -290,22 +290,37 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     module_class = f"{type(module).__module__}.{name}"
     reference = pipelines_of(slot, actor, *own, observation_space, action_space)
     start_loop = partial(NewStackLoop, reference, recipe, network, module)
-    if slot.others and reference.has_own:
+    if slot is not SINGLE_AGENT and reference.has_own:
         _check_agents(files, reference, start_loop)
     return RestoredPolicy(recipe, network, module_class, start_loop, slot.agents, reference=how)
 
 
 def _check_agents(files: CheckpointFiles, pipelines: Any, start_loop: Callable[[], NewStackLoop]) -> None:
-    """Raise AgentsDifferError if connectors of the user's own act otherwise for another agent of the module."""
-    slot, loops = pipelines.slot, [start_loop()]
-    for agent in slot.others:
-        loops.append(loop := start_loop())
-        loop.pipelines = dataclasses.replace(pipelines, slot=dataclasses.replace(slot, agent=agent)).fresh()
+    """Let connectors of the user's own act for the module's other agents, and beside agents of other modules.
+
+    Raises AgentsDifferError if they act otherwise for those, UnsupportedError if they act otherwise beside these.
+    """
+    slot = pipelines.slot
+    varied = {
+        agent: dataclasses.replace(pipelines, slot=dataclasses.replace(slot, agent=agent)) for agent in slot.others
+    }
+    loops = [start_loop() for _ in range(2 + len(varied))]
+    for loop, changed in zip(loops[1:], (pipelines.in_company(), *varied.values()), strict=True):
+        loop.pipelines = changed.fresh()
     for batch in [batch for batch in draw_batches(loops[0].recipe, seed=0) if len(batch) == 1][:AGENT_STEPS]:
         restart = np.ones(1, np.bool_) if batch.restart is None else batch.restart
         first, *others = (loop.step(batch.inputs, restart) for loop in loops)
-        for agent, outputs in zip(slot.others, others, strict=True):
-            if not all(np.allclose(outputs[name], first[name], 1e-4, 1e-5, equal_nan=True) for name in first):
+        same = [
+            all(np.allclose(outputs[name], first[name], 1e-4, 1e-5, equal_nan=True) for name in first)
+            for outputs in others
+        ]
+        if not same[0]:
+            raise UnsupportedError(
+                f"{files.root}: a connector of your own acts differently for agent {slot.agent} when other agents act "
+                "too: a served policy is given one agent's observation, so put into it what it needs of the others"
+            )
+        for agent, is_same in zip(varied, same[1:], strict=True):
+            if not is_same:
                 raise AgentsDifferError(
                     f"{files.root}: module '{slot.module}' serves the agents {slot.agent} and {agent}, and a connector "
                     "of your own acts differently for them: name the one to export for with --agent-id",

@@ -96,6 +96,15 @@ def test_a_network_that_reads_parts_in_the_environments_order_is_refused(
         export("out_of_order")
 
 
+def test_a_connector_that_reads_other_agents_is_refused_for_those_it_changes(
+    reported_zoo: Path, export: Callable[..., ExportResult]
+) -> None:
+    with pytest.raises(UnsupportedError, match=r"acts differently for agent left when other agents act too: a served"):
+        export("sees_the_base_team", module_id="arms")
+    result = export("sees_the_base_team", module_id="wheels")
+    assert_acts_as_recorded(result, reported_zoo / "sees_the_base_team_base.npz")
+
+
 @pytest.mark.parametrize("name", ["asymmetric", "removed_key"])
 def test_a_part_that_nothing_reads_is_not_asked_for_and_may_be_given(
     reported_zoo: Path, export: Callable[..., ExportResult], app: Path, name: str

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from ray.rllib.connectors.env_to_module.observation_preprocessor import MultiAgentObservationPreprocessor
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.apis import ValueFunctionAPI
 from ray.rllib.core.rl_module.torch import TorchRLModule
@@ -144,6 +145,17 @@ class InOrder(TorchRLModule, ValueFunctionAPI):
 
     def compute_values(self, batch: dict[str, Any], embeddings: Any = None) -> Any:
         return self.values(self._read(batch)).squeeze(-1)
+
+
+class SeesTheBase(MultiAgentObservationPreprocessor):
+    """Gives the arms what the base sees, if it acts."""
+
+    def preprocess(self, observations: dict[str, Any], episode: Any) -> dict[str, Any]:
+        seen = float(observations.get("base", [0.0])[0])
+        return {agent: obs + np.float32(agent != "base") * seen for agent, obs in observations.items()}
+
+    def torch_forward(self, obs: Any) -> Any:
+        return obs
 
 
 class OutOfOrder(MultiAgentEnv):
