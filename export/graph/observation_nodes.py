@@ -95,12 +95,15 @@ class FlattenNode(ObservationNode):
         kept = [
             leaf for name, leaf in leaves.items() if not any(name == r or name.startswith(f"{r}.") for r in removed)
         ]
+        # PrevActionsPrevRewards has an empty Box in its space for what it does not add to the observation.
+        kept = [leaf for leaf in kept if leaf is None or 0 not in leaf.shape]
         self.codes: list[Callable[[Tensor], Tensor]] = [_code(leaf) for leaf in kept]
 
     def forward(self, obs: Tree, state: dict[str, Tensor]) -> Tree:  # noqa: ARG002  # it has no state
         if self.without:
             obs = {key: value for key, value in obs.items() if key not in self.without}
-        parts = [code(leaf) for code, leaf in zip(self.codes, tree_leaves(obs), strict=True)]
+        given = [leaf for leaf in tree_leaves(obs) if 0 not in leaf.shape[1:]]
+        parts = [code(leaf) for code, leaf in zip(self.codes, given, strict=True)]
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
 

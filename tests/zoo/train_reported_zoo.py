@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from ray import tune
 from ray.rllib.algorithms.ppo import PPOConfig
-from ray.rllib.connectors.env_to_module import FlattenObservations
+from ray.rllib.connectors.env_to_module import FlattenObservations, PrevActionsPrevRewards
 from ray.rllib.connectors.env_to_module.observation_preprocessor import SingleAgentObservationPreprocessor
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
@@ -68,6 +68,10 @@ def without_critic() -> Any:
     return FlattenObservations(zoo_reported.OBSERVATIONS["privileged"], keys_to_remove=["critic"])
 
 
+def previous_actions() -> Any:
+    return PrevActionsPrevRewards(n_prev_actions=2, n_prev_rewards=0)
+
+
 def external() -> Any:
     """An algorithm whose environment runs elsewhere and sends episodes to a port."""
     space = zoo_reported.OBSERVATIONS["vector"]
@@ -117,6 +121,7 @@ def configurations() -> dict[str, Any]:
         "critic_in_training": ppo("vector", "discrete", module=zoo_reported.NeedsItsCritic),
         "partly_read": ppo("partly_read", "discrete", module=zoo_reported.PartReader),
         "removed_key": ppo("privileged", "box", without_critic),
+        "previous_actions": ppo("vector", "discrete", previous_actions, flat),
         "in_order": ppo("unsorted", "discrete", module=zoo_reported.InOrder),
         "out_of_order": out_of_order(zoo_reported.InOrder),
         "out_of_order_flat": out_of_order(None),

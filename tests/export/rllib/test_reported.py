@@ -62,7 +62,7 @@ def assert_acts_as_recorded(result: ExportResult, file: Path) -> None:
     "name",
     [
         "asymmetric", "critic_in_training", "partly_read", "removed_key", "infinite_buffers", "image_lstm", "unusual",
-        "uint32",
+        "uint32", "previous_actions",
     ],
 )  # fmt: skip
 def test_the_export_acts_as_rllib_did(reported_zoo: Path, export: Callable[..., ExportResult], name: str) -> None:
