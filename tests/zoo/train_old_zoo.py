@@ -182,6 +182,7 @@ def configurations(out: Path) -> dict[str, Any]:
         "choice": toy("choice"),
         "shifted": toy("shifted", filtered="MeanStdFilter"),
         "dials": toy("dials"),
+        "gauge": toy("gauge"),
         "nested": toy("nested"),
         "filtered_nested": toy("nested", filtered="MeanStdFilter"),
         "camera": toy("camera", model=picture),

@@ -113,7 +113,7 @@ class OldStackLoop:
             if begins:
                 policy.agent_connectors.reset(env)
             self._steps[env] = -1 if begins else self._steps[env] + 1  # RLlib counts the initial observation as -1
-            leaves = {name: values[row] for name, values in inputs.items()}
+            leaves = {name: values[row, ...] for name, values in inputs.items()}  # of no axis: still an array
             columns = {
                 SampleBatch.NEXT_OBS: build_in_order(self._recipe.observation_space, leaves),
                 SampleBatch.INFOS: {},

@@ -53,6 +53,7 @@ EXPORTED = [
     "distributional_dqn", "sac", "unnormalized_sac", "discrete_sac", "appo", "impala", "marwil", "cloned", "cql",
     "user_model", "bearing", "named_model", "lstm", "continuous_lstm", "user_recurrent", "choice", "shifted", "dials",
     "nested", "filtered_nested", "camera", "levers", "limbs", "masked", "named_distribution", "tempered", "counts",
+    "gauge",
 ]  # fmt: skip
 SEVERAL = ["several_arm", "several_cart"]
 

@@ -35,6 +35,10 @@ SPACES: dict[str, tuple[gym.Space[Any], gym.Space[Any]]] = {
     "choice": (Discrete(6), Discrete(2)),
     "shifted": (Discrete(4, start=3), Box(-1.0, 1.0, (2,), np.float32)),
     "dials": (gym.spaces.MultiDiscrete([3, 4]), Box(-1.0, 1.0, (2,), np.float32)),
+    "gauge": (
+        gym.spaces.Dict({"heat": Box(-1.0, 1.0, (), np.float32), "gear": Discrete(3)}),
+        Box(-1.0, 1.0, (2,), np.float32),
+    ),
     "nested": (
         gym.spaces.Dict(
             {
