@@ -112,7 +112,7 @@ def _prove_format(
             _check_form(where, output, got.get(output), expected, recipe.action_leaves.get(output), reference.framework)
         result = comparer.compare(number, got)
         if result.fault is not None:
-            raise _differs(where, result.fault, reference, labels)
+            raise _differs(where, result.fault, reference, recipe, labels)
         max_abs, max_rel = max(max_abs, result.max_abs), max(max_rel, result.max_rel)
     return FormatParity(max_abs=max_abs, max_rel=max_rel)
 
@@ -130,7 +130,7 @@ def _check_form(
             raise ParityError(f"{where}: the action is {got.dtype}, the action space has {dtype}")
 
 
-def _differs(where: str, fault: Fault, reference: Reference, labels: Sequence[str]) -> ParityError:
+def _differs(where: str, fault: Fault, reference: Reference, recipe: Recipe, labels: Sequence[str]) -> ParityError:
     details = {
         "output": fault.output, "element": fault.element, "sample": fault.row, "exported": fault.got,
         "reference": fault.expected, "observation": _row(reference.batch, fault.row),
@@ -139,11 +139,16 @@ def _differs(where: str, fault: Fault, reference: Reference, labels: Sequence[st
     if fault.output == "action" and fault.element is not None and fault.element < len(labels):
         element += f" ({labels[fault.element]})"
     place = f"{where}: output '{fault.output}'{element}, sample {fault.row}"
+    own = ", ".join(step.name for step in recipe.user_steps)
+    must = f"; torch_forward of {own} must do what the connector does for this agent, and no state may change"
+    advice = must if own else ""
     if fault.allowed is None:
-        return ParityError(f"{place}: the export chooses {fault.got}, {reference.framework} {fault.expected}", details)
+        return ParityError(
+            f"{place}: the export chooses {fault.got}, {reference.framework} {fault.expected}{advice}", details
+        )
     return ParityError(
         f"{place}: the export gives {fault.got:.9g}, {reference.framework} {fault.expected:.9g} (allowed difference "
-        f"{fault.allowed:.2g}); {fault.rows} of {len(reference.batch)} samples differ",
+        f"{fault.allowed:.2g}); {fault.rows} of {len(reference.batch)} samples differ{advice}",
         details,
     )
 

@@ -244,6 +244,11 @@ class Recipe:
         return (*carried, *self.network_state)
 
     @property
+    def user_steps(self) -> tuple[UserStep, ...]:
+        """The user's own connectors."""
+        return (*(step for step in self.steps if isinstance(step, UserStep)), *self.action_steps)
+
+    @property
     def needs_reward(self) -> bool:
         """Whether the graph has an input `reward`: the last action's reward, 0 at an episode's start."""
         return any(isinstance(step, Previous) and step.rewards > 0 for step in self.steps)

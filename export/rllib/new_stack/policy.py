@@ -72,7 +72,7 @@ from rlservo.export.rllib.new_stack.older_components import (
     set_saved_state,
 )
 from rlservo.export.rllib.new_stack.pipelines import NoInfo, Pipelines, find_agent_slot, own_copy, pipelines_of
-from rlservo.export.rllib.new_stack.same_connectors import check_same
+from rlservo.export.rllib.new_stack.same_connectors import ADVICE, check_same
 from rlservo.export.rllib.supported_spaces import check_spaces
 from rlservo.export.sources.restored_policy import RestoredPolicy, diverged_weights
 
@@ -474,7 +474,9 @@ def _explained(folder: Path) -> Iterator[None]:
     except CheckpointError:
         raise
     except Exception as error:  # whatever RLlib, torch or the user's own constructor raises
-        raise CheckpointError(f"{folder} cannot be restored: {explain(error)}{_other_ray(folder)}") from error
+        arguments = isinstance(error, TypeError) and folder.name in (ENV_TO_MODULE, MODULE_TO_ENV)
+        advice = f"; {ADVICE}" if arguments else ""
+        raise CheckpointError(f"{folder} cannot be restored: {explain(error)}{_other_ray(folder) or advice}") from error
     finally:
         deprecation.removeFilter(_not_rllibs_own)
 

@@ -25,6 +25,10 @@ ADVICE = (
     "__init__ of its own that calls super().__init__() first, changes no argument and sets every attribute from one, "
     "then restore and save the checkpoint again"
 )
+OF_RLLIBS_OWN = (
+    "the folder holds files of two checkpoints, or the attribute was set when the connector had been made: give it as "
+    "an argument, then restore and save the checkpoint again"
+)
 DATA = (bool, int, float, complex, str, bytes, type(None), np.ndarray, np.generic, torch.Tensor, Space)
 
 
@@ -46,10 +50,11 @@ def check_same(where: str, listed: tuple[Any, Any], built: tuple[Any, Any], buil
         return
     changing = dict(_differences(build(), built))
     for (side, name, attribute), (saved, configured) in differences.items():
+        advice = OF_RLLIBS_OWN if name.startswith("ray.") else ADVICE
         if (side, name, attribute) not in changing:
             raise UnsupportedError(
                 f"{where}: the {side} connector {name} has {attribute}={reprlib.repr(configured)} in the algorithm's "
-                f"configuration, and {attribute}={reprlib.repr(saved)} in the arguments that RLlib saved; {ADVICE}"
+                f"configuration, and {attribute}={reprlib.repr(saved)} in the arguments that RLlib saved; {advice}"
             )
 
 

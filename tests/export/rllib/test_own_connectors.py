@@ -70,7 +70,10 @@ def test_connectors_of_several_agents_are_exported(connector_zoo: Path, export: 
         ("inherited_in_the_middle", r"zoo_connectors\.Inherited has gain=3\.0 .* and gain=1\.0"),
         ("attribute", r"zoo_connectors\.Gain has gain=3\.0 .* and gain=1\.0"),
         ("attribute_action", r"zoo_connectors\.ActionGain has gain=0\.3 .* and gain=1\.0"),
-        ("attribute_of_rllibs", r"mean_std_filter\.MeanStdFilter has clip_by_value=0\.5 .* and clip_by_value=10\.0"),
+        (
+            "attribute_of_rllibs",
+            r"mean_std_filter\.MeanStdFilter has clip_by_value=0\.5 .* and clip_by_value=10\.0 .* two checkpoints, or",
+        ),
         ("converted", r"zoo_connectors\.Converted has gain=6\.0 .* and gain=12\.0"),
         ("converted_action", r"zoo_connectors\.ConvertedAction has gain=0\.6 .* and gain=1\.2"),
         (
@@ -96,7 +99,10 @@ def test_it_is_refused_for_every_agent(connector_zoo: Path, export: Callable[...
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("renamed", r"env_to_module_connector cannot be restored: .*unexpected keyword argument 'gain'"),
+        (
+            "renamed",
+            r"env_to_module_connector cannot be restored: .* argument 'gain'; RLlib acts by .* give the class",
+        ),
         (
             "of_the_environment",
             r"would: the function reads the environment's 'envs', .* argument 'spaces'",
@@ -119,7 +125,8 @@ def test_a_connector_that_knows_its_agents_is_exported_for_the_one_that_is_named
         export(connector_zoo / name, module_id="arms")
     result = export(connector_zoo / name, module_id="arms", agent_id="left")
     assert_acts_as_restored(result, connector_zoo / f"{name}_left.npz")
-    with pytest.raises(ParityError):  # what the connector does for the other is not what its torch_forward does
+    # What the connector does for the other is not what its torch_forward does.
+    with pytest.raises(ParityError, match=r"torch_forward of zoo_connectors\.\w+ must do what .* for this agent"):
         export(connector_zoo / name, module_id="arms", agent_id="right")
 
 
