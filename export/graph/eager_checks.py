@@ -12,11 +12,12 @@ import random
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from rlservo.errors import UnsupportedError, first_line
 from rlservo.export.graph.policy_graph import PolicyGraph
@@ -27,13 +28,14 @@ from rlservo.export.recipe.runners import Inputs
 READS = frozenset({
     Tensor.__bool__, Tensor.__int__, Tensor.__float__, Tensor.__complex__, Tensor.__index__, Tensor.__contains__,
     Tensor.__array__, Tensor.numpy, Tensor.item, Tensor.tolist, Tensor.equal, Tensor.allclose, Tensor.is_nonzero,
-    Tensor.as_subclass, Tensor.__format__, torch.equal, torch.allclose, torch.is_nonzero,
+    Tensor.__format__, Tensor.__dlpack__, Tensor.storage, Tensor.untyped_storage, Tensor.data_ptr, Tensor.new_tensor,
+    torch.equal, torch.allclose, torch.is_nonzero, torch.tensor,
 })  # fmt: skip
-"""Functions that take a tensor's numbers out of torch."""
+"""Functions that take a tensor's numbers out of torch. `print` does too, and decides nothing."""
 SELECTS = frozenset({
-    torch.nonzero, torch.argwhere, torch.masked_select, torch.unique, torch.unique_consecutive,
-    torch.bincount, Tensor.nonzero, Tensor.argwhere, Tensor.masked_select, Tensor.unique, Tensor.unique_consecutive,
-    Tensor.bincount,
+    torch.nonzero, torch.argwhere, torch.masked_select, torch.unique, torch.unique_consecutive, torch.bincount,
+    Tensor.nonzero, Tensor.argwhere, Tensor.masked_select, Tensor.unique, Tensor.unique_consecutive, Tensor.bincount,
+    torch.zeros, torch.ones, torch.empty, torch.arange,
 })  # fmt: skip
 """Functions whose results have as many numbers as the observation's say."""
 SIZES = frozenset({
@@ -142,30 +144,54 @@ def _generators() -> tuple[Any, ...]:
     return torch.get_rng_state().numpy().tobytes(), np.asarray(keys).tobytes(), kind, position, random.getstate()
 
 
-class _Followed(Tensor):
-    """A tensor that was computed from the observation, and reports where its numbers are read in Python.
+class _Follower(TorchFunctionMode):
+    """Calls `report` where Python reads numbers of a tensor that was computed from the observation.
 
-    The size of some depends on numbers of the observation too: to read it is to read those.
+    Such a tensor is known by its memory: a buffer that was filled with the observation, and a view of it, are others'
+    objects. The size of some depends on numbers of the observation too: to read it is to read those.
     """
 
-    reports: ClassVar[list[Callable[[], None]]] = []
-    """What is called at each read."""
-    is_sized: bool = False
+    def __init__(self, tensors: Sequence[Tensor], report: Callable[[], None]) -> None:
+        super().__init__()
+        self._report = report
+        self._kept: list[Tensor] = []  # kept alive, so that no other tensor gets their memory
+        self._memory: set[int] = set()
+        self._sized: set[int] = set()
+        for tensor in tensors:
+            self._follow(tensor)
 
-    @classmethod
-    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None) -> Any:
-        given = [one for one in _tensors((args, kwargs)) if isinstance(one, _Followed)]
-        is_sized = any(one.is_sized for one in given)
-        if func in READS or (is_sized and func in SIZES):
-            for report in _Followed.reports:
-                report()
-        result = super().__torch_function__(func, types, args, kwargs or {})  # type: ignore[no-untyped-call]
-        selects = func in SELECTS or (func is Tensor.__getitem__ and _is_mask(args[1]))
-        if is_sized or selects or (func is torch.where and len(args) + len(kwargs or {}) == 1):
-            for one in _tensors(result):
-                if isinstance(one, _Followed) and one.dim():
-                    one.is_sized = True
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None) -> Any:
+        options = kwargs or {}
+        given = [one for one in _tensors((args, options)) if not self._memory.isdisjoint(_memory(one))]
+        is_sized = any(id(one) in self._sized for one in given)
+        if given and (func in READS or (is_sized and func in SIZES)):
+            self._report()
+        result = func(*args, **options)
+        if given:
+            for one in _tensors((result, options.get("out"), args[0] if _writes(func) else None)):
+                self._follow(one)
+            selects = func in SELECTS or (func is Tensor.__getitem__ and _is_mask(args[1]))
+            if is_sized or selects or (func is torch.where and len(args) + len(options) == 1):
+                self._sized.update(id(one) for one in _tensors(result) if one.dim())
         return result
+
+    def _follow(self, tensor: Tensor) -> None:
+        self._kept.append(tensor)
+        self._memory.update(_memory(tensor))
+
+
+def _memory(tensor: Tensor) -> set[int]:
+    """Return what a tensor shares with its views: the address of its numbers; and its own, as it may have none."""
+    try:
+        return {id(tensor), tensor.untyped_storage().data_ptr() or id(tensor)}
+    except (RuntimeError, NotImplementedError):  # a kind of tensor without a storage
+        return {id(tensor)}
+
+
+def _writes(func: Any) -> bool:
+    """Return whether a function of torch writes into its first argument."""
+    name = getattr(func, "__name__", "")
+    return name in ("__setitem__", "__set__") or (name.endswith("_") and not name.endswith("__"))
 
 
 def _tensors(value: Any) -> Iterator[Tensor]:
@@ -182,10 +208,7 @@ def _is_mask(index: Any) -> bool:
 
 
 def _reads(graph: PolicyGraph, tensors: Sequence[Tensor]) -> list[str]:
-    """Return the places in the user's own code, but for assertions, that read the observation's numbers in Python.
-
-    Raises UnsupportedError if the network does not run on tensors that report it.
-    """
+    """Return the places in the user's own code, but for assertions, that read the observation's numbers in Python."""
     places: set[str] = set()
 
     def report() -> None:
@@ -195,17 +218,15 @@ def _reads(graph: PolicyGraph, tensors: Sequence[Tensor]) -> list[str]:
         if not _is_of_a_framework(reader.filename) and not _asserts(reader.filename, reader.lineno or 0):
             places.add(f"{reader.filename}:{reader.lineno}")
 
-    _Followed.reports.append(report)
+    given = [tensor.clone() for tensor in tensors]
     try:
-        with torch.no_grad():
-            graph(*(tensor.as_subclass(_Followed) for tensor in tensors))
-    except Exception as error:  # an operation may take plain tensors only
+        with torch.no_grad(), _Follower(given, report):
+            graph(*given)
+    except Exception as error:  # torch's higher order operators do not take a mode
         raise UnsupportedError(
-            "the network does not run on a subclass of torch.Tensor, with which the export looks for numbers that are "
+            "the network does not run under a TorchFunctionMode, with which the export looks for numbers that are "
             f"read in Python: {first_line(error)}{raised_at(error)}"
         ) from error
-    finally:
-        _Followed.reports.remove(report)
     return sorted(places)
 
 

@@ -345,6 +345,35 @@ class LoopsOverWhatIsNear(Honest):
         return action
 
 
+class ReadsElsewhere(Honest):
+    """Reads numbers of the observation in a tensor that was not computed from it, but holds them."""
+
+    def __init__(self, copied: Callable[[Tensor], Any]) -> None:
+        super().__init__()
+        self.copied = copied
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return -super().forward(obs) if bool(self.copied(obs).max() > 1e7) else super().forward(obs)
+
+
+def assigned(obs: Tensor) -> Tensor:
+    buffer = torch.zeros(len(obs), 5)
+    buffer[:, 1:4] = obs
+    return buffer
+
+
+def copied_into_a_view(obs: Tensor) -> Tensor:
+    buffer = torch.zeros(len(obs), 5)
+    buffer[:, 1:4].copy_(obs)
+    return buffer
+
+
+def written(obs: Tensor) -> Tensor:
+    buffer = torch.empty_like(torch.zeros(obs.shape))
+    torch.mul(obs, 1.0, out=buffer)
+    return buffer
+
+
 class TakesPlainTensorsOnly(Honest):
     def forward(self, obs: Tensor) -> Tensor:
         assert type(obs) is Tensor or torch.jit.is_tracing()
@@ -409,7 +438,15 @@ def export(module: nn.Module, out: Path, **options: Any) -> rlservo.ExportResult
         (GoesThroughNumpy(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
         (CountsWhatIsNear(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
         (LoopsOverWhatIsNear(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
-        (TakesPlainTensorsOnly(), "does not run on a subclass of torch.Tensor"),
+        (ReadsElsewhere(assigned), "reads numbers of the observation in Python at"),
+        (ReadsElsewhere(copied_into_a_view), "reads numbers of the observation in Python at"),
+        (ReadsElsewhere(written), "reads numbers of the observation in Python at"),
+        (ReadsElsewhere(lambda obs: torch.tensor([obs[0, 0], obs[0, 1]])), "reads numbers of the observation"),
+        (ReadsElsewhere(torch.Tensor), "reads numbers of the observation in Python at"),
+        (ReadsElsewhere(lambda obs: obs.as_subclass(Tensor)), "reads numbers of the observation in Python at"),
+        (ReadsElsewhere(np.from_dlpack), "reads numbers of the observation in Python at"),
+        (ReadsElsewhere(lambda obs: torch.tensor(obs.untyped_storage().tolist())), "reads numbers of the observation"),
+        (TakesPlainTensorsOnly(), "reads numbers of the observation in Python at"),
         (ReadsANumber(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, nn.Module) else "",
