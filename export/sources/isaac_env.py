@@ -155,9 +155,22 @@ def _bounds(terms: Mapping[str, _Term]) -> tuple[NDArray[np.float32], NDArray[np
 
 
 def _kind(term: Any) -> str:
-    """Return the class's name, with its module if it is not the library's own; '' if there is none."""
-    path = str(term.get("class_type") or "") if isinstance(term, Mapping) else ""
+    return class_name(str(term.get("class_type") or "") if isinstance(term, Mapping) else "")
+
+
+def class_name(path: str) -> str:
+    """Return a class's name, with its module if it is not the library's own; '' if there is none."""
     return re.split(r"[.:]", path)[-1] if LIBRARIES.match(path) else path
+
+
+def clip_actions(agent_file: Path, agent: Mapping[str, Any]) -> float | None:
+    """Return to what the training's wrapper for rsl_rl clips actions, before their terms scale them."""
+    limit = agent.get("clip_actions")
+    if limit is None:
+        return None
+    if not isinstance(limit, int | float) or not 0 <= limit < np.inf:
+        raise CheckpointError(f"{agent_file}: clip_actions is {limit!r}: expected null, or a finite number")
+    return float(limit)
 
 
 def _asset(term: Mapping[str, Any]) -> str:

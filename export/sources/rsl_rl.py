@@ -127,7 +127,7 @@ def _why_not_weights(error: Exception) -> str:
 
 
 def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> RestoredPolicy:
-    from rlservo.export.sources.isaac_env import action_terms, read_yaml
+    from rlservo.export.sources.isaac_env import action_terms, clip_actions, read_yaml
     from rlservo.export.sources.isaac_observations import observation_elements
     from rlservo.export.sources.restored_policy import ElementNames
     from rlservo.export.sources.torch_policy import TorchPolicy, restored
@@ -139,7 +139,7 @@ def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> Restor
     actor = _actor(file, agent, part, state_dict)
     size = actor.distribution.output_dim if actor.distribution is not None else state_dict[_last(state_dict)].shape[0]
     environment = file.parent / ENVIRONMENT
-    terms = action_terms(environment, size, _clip_actions(agent_file, agent), joint_order)
+    terms = action_terms(environment, size, clip_actions(agent_file, agent), joint_order)
     groups = _groups(agent_file, agent, part)
     if len(groups) > 1:
         notify(f"an observation concatenates the groups {', '.join(groups)}, in this order")
@@ -196,15 +196,6 @@ def _acting_part(
     if not isinstance(state_dict, dict) or not all(isinstance(each, torch.Tensor) for each in state_dict.values()):
         raise CheckpointError(f"{file}: its '{ACTORS[part]}' is not a dictionary of tensors")
     return part, state_dict
-
-
-def _clip_actions(agent_file: Path, agent: Mapping[str, Any]) -> float | None:
-    limit = agent.get("clip_actions")
-    if limit is None:
-        return None
-    if not isinstance(limit, int | float) or not 0 <= limit < np.inf:
-        raise CheckpointError(f"{agent_file}: clip_actions is {limit!r}: expected null, or a finite number")
-    return float(limit)
 
 
 def _groups(agent_file: Path, agent: Mapping[str, Any], part: str) -> list[str]:

@@ -25,10 +25,11 @@ import numpy as np
 
 from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.facts import CheckpointFacts
-from rlservo.export.sources.isaac_env import KINDS, read_yaml
+from rlservo.export.sources.isaac_env import KINDS, class_name, clip_actions, read_yaml
 
 DESCRIPTORS = ("IO_descriptors.yaml", "io_descriptors/IO_descriptors.yaml", "../io_descriptors/IO_descriptors.yaml")
 DEPLOYS = ("deploy.yaml", "params/deploy.yaml", "../params/deploy.yaml")
+AGENTS = ("params/agent.yaml", "../params/agent.yaml")
 """Places beside the file: of a run's `exported/policy.onnx`, the run's folder."""
 LENGTHS = {
     "default_joint_pos": "joint_names",
@@ -81,7 +82,14 @@ class Annotation:
 
 def annotation_files(model: Path) -> list[Path]:
     """Return the files beside a model that are read with it."""
-    return [file for name in (*DESCRIPTORS, "manifest.json", *DEPLOYS) if (file := model.parent / name).is_file()]
+    names = (*DESCRIPTORS, "manifest.json", *DEPLOYS, *AGENTS)
+    return [file for name in names if (file := model.parent / name).is_file()]
+
+
+def limit_of(model: Path) -> float | None:
+    """Return the `clip_actions` of the run that a model is of: the training's wrapper clips before it scales."""
+    agents = [file for name in AGENTS if (file := model.parent / name).is_file()]
+    return clip_actions(agents[0], read_yaml(agents[0])) if agents else None
 
 
 def read_annotations(
@@ -99,6 +107,8 @@ def read_annotations(
     for file in annotation_files(model):
         if file.name == "IO_descriptors.yaml":
             found.append((str(file), partial(_descriptors, file)))
+        elif file.name == "agent.yaml":
+            continue
         elif file.name == "deploy.yaml":
             found.append((str(file), partial(_deploy, file, size, joint_order)))
         elif (manifest := _json(file)).get("format") == "policy_package":
@@ -229,7 +239,7 @@ def _descriptors(file: Path) -> Annotation:
     described = read_yaml(file)
     terms = [
         (
-            re.split(r"[.:]", str(term["full_path"]))[-1],
+            class_name(str(term["full_path"])),
             term.get("joint_names") or [],
             int(np.prod(term["shape"])),
             term,

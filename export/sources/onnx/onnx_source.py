@@ -34,6 +34,7 @@ from rlservo.export.sources.onnx.onnx_annotations import (
     Annotation,
     Term,
     annotation_files,
+    limit_of,
     merged,
     read_annotations,
     read_facts,
@@ -161,14 +162,18 @@ def _check_sizes(
 
 def _recipe(said: Annotation, file: Path, tensors: Tensors, options: RestoreOptions) -> Recipe:
     shape = tensors.action.row
-    affine = None
-    if said.command and said.scale and said.offset:
+    affine, limit = None, limit_of(file)
+    if _is_scaled(said):
         affine = Affine(
-            np.array(said.scale, np.float32).reshape(shape), np.array(said.offset, np.float32).reshape(shape)
+            np.array(said.scale, np.float32).reshape(shape), np.array(said.offset, np.float32).reshape(shape), limit
         )
+    elif limit is not None:
+        affine = Affine(np.ones(shape, np.float32), np.zeros(shape, np.float32), limit)
     low, high = (np.array(side, np.float32).reshape(shape) for side in zip(*said.clip, strict=True)) if said.clip else (
         np.full(shape, side, np.float32) for side in options.action_range or (-np.inf, np.inf)
     )  # fmt: skip
+    if options.action_range is not None and (low > high).any():
+        raise UsageError(f"the action range {options.action_range}: expected the lower bound first")
     bounded = bool(np.isfinite([low, high]).any())
     if said.clip and bounded and options.action_range is not None:
         raise UsageError(f"--action-range {options.action_range}: {said.place} has the clip {list(said.clip)}")
@@ -185,6 +190,10 @@ def _recipe(said: Annotation, file: Path, tensors: Tensors, options: RestoreOpti
     )
 
 
+def _is_scaled(said: Annotation) -> bool:
+    return bool(said.command and said.scale and said.offset)
+
+
 def _elements(said: Annotation, recipe: Recipe, main: StageTensor | None, joint_order: Sequence[str]) -> ElementNames:
     from rlservo.export.sources.restored_policy import ElementNames
 
@@ -192,6 +201,8 @@ def _elements(said: Annotation, recipe: Recipe, main: StageTensor | None, joint_
     joints = said.joints or tuple(joint_order)
     if joints and len(joints) != size:
         raise CheckpointError(f"the joint order has {len(joints)} joints, but the action has {size} elements")
+    if twice := [joint for joint in dict.fromkeys(joints) if joints.count(joint) > 1]:
+        raise CheckpointError(f"the action's joints ({', '.join(joints)}) have {', '.join(twice)} more than once")
     if joint_order and list(joints) != [joint for joint in joint_order if joint in joints]:
         raise CheckpointError(
             f"the joint order that was given ({', '.join(joint_order)}) is not that of {said.place} "
@@ -201,7 +212,7 @@ def _elements(said: Annotation, recipe: Recipe, main: StageTensor | None, joint_
     for index in range(size):
         joint = joints[index] if joints else ""
         known: dict[str, Any] = {"quantity": "raw"}
-        if recipe.affine is not None:
+        if _is_scaled(said):
             known = {"quantity": said.command[index], "unit": UNITS[said.command[index]], "scale": 1.0, "offset": 0.0}
         actions.append(Element(name=joint or f"action_{index}", joint=joint, **known))
     observation: tuple[Element, ...] = ()

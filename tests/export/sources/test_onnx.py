@@ -10,7 +10,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -321,6 +321,35 @@ def test_isaac_labs_descriptors_give_offsets_rate_and_clip(tmp_path: Path, notic
     assert notices == []
 
 
+@pytest.mark.parametrize("origin", [isaac_lab, mjlab, unitree])
+def test_the_actions_of_a_run_are_clipped_before_they_are_scaled(origin: Origin, tmp_path: Path) -> None:
+    """By the wrapper that rsl_rl trains behind: `torch.clamp(actions, -clip_actions, clip_actions)`."""
+    given = origin(tmp_path)
+    agent = tmp_path / "params" / "agent.yaml"
+    agent.parent.mkdir(exist_ok=True)
+    agent.write_text(yaml.safe_dump({"class_name": "OnPolicyRunner", "clip_actions": 0.05}))
+    scale, offset = np.asarray(given.scale), np.asarray(given.offset)
+    seen, unclipped = episode(replace(given, scale=1.0, offset=0.0, clip=(-np.inf, np.inf)), 12)
+    with Policy.load(export(given, tmp_path / "out").path) as policy:
+        for obs, raw in zip(seen, unclipped, strict=True):
+            wanted = np.clip(np.clip(raw, -0.05, 0.05) * scale + offset, *given.clip)
+            np.testing.assert_allclose(policy.act(row(obs)), wanted, rtol=1e-5, atol=2e-6)
+    assert np.abs(unclipped).max() > 0.05
+
+
+def test_an_action_term_of_another_package_is_not_isaac_labs_by_its_name(tmp_path: Path, notices: list[str]) -> None:
+    described = descriptors()
+    described["actions"][0] |= {"full_path": "my_robot.actions.JointPositionAction", "clip": None}
+    result = export(isaac_lab(tmp_path, actions=described["actions"]), tmp_path / "out", notices)
+    assert any("an action term is a my_robot.actions.JointPositionAction, which is more than" in one for one in notices)
+    assert {element[2] for element in elements(result, "action")} == {"raw"}
+
+
+def test_an_action_range_whose_bounds_are_swapped_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"the action range \(3.0, -3.0\): expected the lower bound first"):
+        export(mjlab(tmp_path), tmp_path / "out", action_range=(3.0, -3.0))
+
+
 def test_a_manifests_facts_are_the_contracts(tmp_path: Path) -> None:
     origin = export(microduck(tmp_path), tmp_path / "out").contract.provenance
     assert (origin.env_id, origin.training_iterations) == ("Mjlab-PoliteBow-Flat-MicroDuck", 3000)
@@ -337,6 +366,7 @@ def test_a_manifests_facts_are_the_contracts(tmp_path: Path) -> None:
          "joint_names has 3 entries, default_joint_pos has 2"),
         (mjlab, {"observation_terms_scale": "1.000"}, CheckpointError,
          "observation_names has 5 entries, observation_terms_scale has 1"),
+        (mjlab, {"joint_names": "pan,lift,lift"}, CheckpointError, r"\(pan, lift, lift\) have lift more than once"),
         (mjlab, {"action_scale": "half"}, CheckpointError, "is not as its exporter writes it: ValueError: .*'half'"),
         (microduck, {"obs_len": 60}, CheckpointError,
          "its observation has 60 elements, 'obs' of policy.onnx has 61"),
