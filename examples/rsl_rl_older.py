@@ -2,7 +2,7 @@
 
 rsl_rl 5 does not load those checkpoints, so there is nothing to compare a graph with but this module. Export with
 
-    actor = OlderActor("logs/rsl_rl/arm/model_1500.pt")
+    actor = OlderActor("logs/rsl_rl/arm/model_1500.pt", torch.nn.ELU)
     rlservo.export_policy(actor, actor.observations(), actor.actions(), "policies", name="arm", scale=0.5)
 """
 
@@ -20,13 +20,13 @@ from torch import Tensor
 class OlderActor(torch.nn.Module):
     """The mean action of an actor without a memory: its normalizer, if it has one, and its layers.
 
-    `activation` is agent.yaml's, by default ELU.
+    `activation` is agent.yaml's: nothing in a checkpoint says it.
     """
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, file: str | Path, activation: type[torch.nn.Module] = torch.nn.ELU) -> None:
+    def __init__(self, file: str | Path, activation: type[torch.nn.Module]) -> None:
         super().__init__()
         saved = torch.load(file, map_location="cpu", weights_only=True)
         weights = saved.get("actor_state_dict") or saved["model_state_dict"]
@@ -40,6 +40,9 @@ class OlderActor(torch.nn.Module):
                 self.sizes += weight.shape[::-1]
                 linear.load_state_dict({"weight": weight, "bias": weights[name.replace("weight", "bias")]})
                 layers += [linear, activation()]
+        deviation = next((weights[name] for name in ("std", "log_std") if name in weights), None)
+        if deviation is None or self.sizes[-1:] != [len(deviation)]:  # state_dependent_std, a student, images
+            raise ValueError(f"{file} is not of an actor whose layers end in one mean for each action")
         self.layers = torch.nn.Sequential(*layers[:-1])
         own = {name: value for name, value in weights.items() if re.match(r"(actor_)?obs_normalizer\.", name)}
         # rsl_rl 2 saves it apart; its epsilon is 0.01 in all of them.

@@ -511,13 +511,24 @@ def test_the_actor_of_an_older_rsl_rl_is_exported_as_a_module(release: int, tmp_
     }[release]  # fmt: skip
     critic = {f"critic.{name}": torch.zeros_like(weight) for name, weight in layers.items()}
     torch.save({name: {**part, **critic} for name, part in saved.items()}, model)
-    older = OlderActor(model)
+    older = OlderActor(model, torch.nn.ELU)
     result = rlservo.export_policy(
         older, older.observations(), older.actions(), tmp_path / "out", name="arm", scale=0.5
     )
     episodes = observations()
     wanted = [0.5 * raw for raw in raw_actions(runner, episodes)]
     np.testing.assert_allclose(bundle_actions(result, episodes), wanted, rtol=1e-5, atol=2e-6)
+
+
+def test_an_older_actor_whose_deviation_depends_on_the_state_is_refused(tmp_path: Path) -> None:
+    """rsl_rl 3.1 to 4.0 with `state_dependent_std`: the last layer gives means and deviations; there is no `std`."""
+    from rsl_rl_older import OlderActor
+
+    layers = {"actor.0.weight": torch.zeros(8, 5), "actor.0.bias": torch.zeros(8),
+              "actor.2.weight": torch.zeros(6, 8), "actor.2.bias": torch.zeros(6)}  # fmt: skip
+    torch.save({"model_state_dict": layers}, tmp_path / "model_3.pt")
+    with pytest.raises(ValueError, match="is not of an actor whose layers end in one mean for each action"):
+        OlderActor(tmp_path / "model_3.pt", torch.nn.ELU)
 
 
 MISREAD: dict[str, Callable[[ActionTerms, Affine], ActionTerms]] = {
