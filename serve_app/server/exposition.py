@@ -95,8 +95,9 @@ def process(handler: RequestHandler) -> None:
 def sessions(handler: RequestHandler) -> None:
     """Sample the episodes in memory."""
     episodes, kept, show = handler.episodes, handler.episodes.sessions, handler.metrics
-    now = kept.count()
-    for name in sorted({*now, *episodes.begun, *episodes.lost}):
+    now, store = kept.count(), handler.control.store
+    served = () if store is None else store.names  # from 0 on: a series that begins at 1 shows Prometheus no increase
+    for name in sorted({*served, *now, *episodes.begun, *episodes.lost}):
         show.gauge("rlservo_sessions", "Sessions in this process", now[name], policy=name)
         show.counter("rlservo_sessions_begun", "Sessions begun", episodes.begun[name], policy=name)
         show.counter("rlservo_sessions_evicted", "Sessions forgotten when idle", kept.evicted[name], policy=name)

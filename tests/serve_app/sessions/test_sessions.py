@@ -175,7 +175,9 @@ def test_a_number_and_a_string_that_looks_like_it_are_two_sessions(server: Serve
 
 
 def test_sessions_are_on_metrics(server: Server) -> None:
-    assert server.metrics() == {("rlservo_episodes_remembered",): 0}
+    kinds = ("", "_begun_total", "_evicted_total", "_lost_total")
+    none = {(f"rlservo_sessions{kind}", "leaky"): 0 for kind in kinds}
+    assert server.metrics() == {("rlservo_episodes_remembered",): 0, **none}  # what is first seen at 1 never increases
     server.act("a", reset=True)
     server.act("b", rows=3, reset=True)
     server.act("a", end=True)
