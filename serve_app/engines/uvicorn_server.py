@@ -342,11 +342,14 @@ class _Supervisor(Multiprocess):
         for process in self.processes:
             process.child_conn.close()  # the worker has its own: if it dies in a health check, the wait for it ends
         before = [(process, process.exitcode) for process in self.processes]
+        began = time.monotonic()
         super().keep_subprocess_alive()
+        has_waited = time.monotonic() - began >= HUNG_S  # a worker may also die while it is asked
         left = left_by_dead(Path(os.environ[FOLDER_VARIABLE]))
         for process, code in before:
             if process not in self.processes and process.pid is not None:
-                _log_death(process.pid, code, process.exitcode, left.get(process.pid, []))
+                was_hung = has_waited and code is None and process.exitcode == -signal.SIGKILL
+                _log_death(process.pid, was_hung, process.exitcode, left.get(process.pid, []))
         if self._on_ready is not None and all(_started(process.pid).exists() for process in self.processes):
             self._on_ready()
             self._on_ready = None
@@ -418,16 +421,16 @@ class _Supervisor(Multiprocess):
                     os.kill(process.pid, signal.SIGCONT)
 
 
-def _log_death(pid: int, code: int | None, last_code: int | None, computing: Sequence[str]) -> None:
-    """Log the end of a worker that another replaces; `code` is its exit code before the supervisor killed it."""
-    if code is None and last_code == -signal.SIGKILL:
+def _log_death(pid: int, was_hung: bool, code: int | None, computing: Sequence[str]) -> None:
+    """Log the end of a worker that another replaces; the supervisor has killed one that was hung."""
+    if was_hung:
         how = f"did not answer for {HUNG_S} s and was killed"
-    elif last_code is not None and last_code < 0:
-        how = f"was ended by signal {-last_code} ({signal.strsignal(-last_code)})"
-        if last_code == -signal.SIGKILL:
+    elif code is not None and code < 0:
+        how = f"was ended by signal {-code} ({signal.strsignal(-code)})"
+        if code == -signal.SIGKILL:
             how += ", perhaps because memory ran out,"
     else:
-        how = f"exited with code {last_code}"
+        how = f"exited with code {code}"
     logger.error("worker %d %s while computing %s; it is replaced", pid, how, " and ".join(computing) or "nothing")
 
 

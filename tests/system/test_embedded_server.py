@@ -332,6 +332,12 @@ def test_a_worker_that_dies_is_logged_with_the_signal_and_the_version_it_was_com
                     if "while computing nothing" not in deaths()[-1]:
                         break
                 assert "while computing version 3 of policy 'ur5'" in deaths()[-1]
+        asked, number = wait_for(serving)[0], len(deaths())
+        os.kill(asked, signal.SIGSTOP)
+        time.sleep(2)  # a health check waits for it now
+        os.kill(asked, signal.SIGKILL)
+        wait_for(lambda: len(deaths()) > number)
+        assert deaths()[-1].startswith(f"worker {asked} was ended by signal 9 ")
         idle, number = wait_for(serving)[0], len(deaths())
         os.kill(idle, signal.SIGSEGV)
         wait_for(lambda: len(deaths()) > number)
