@@ -11,7 +11,6 @@ from ctypes.util import find_library
 import pytest
 
 from rlservo.bundle.environment_id import NAMESPACE, importing_id
-from rlservo.envs.registration import ENTRY_POINTS
 
 WINDOW = """
 import sys
@@ -101,8 +100,8 @@ def test_a_display_without_opengl_counts_as_none(mode: str, start: str) -> None:
 @pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="needs a virtual display (Debian: xvfb)")
 def test_windows_open_and_close_one_after_another() -> None:
     environment = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "DISPLAY")}
-    # Randomized-v0 is one of the others, disturbed, and a Rob environment needs a robot.
-    env_ids = [importing_id(f"{NAMESPACE}/{name}") for name in ENTRY_POINTS if "Sim" in name]
+    names = ("EndEffectorPositioningURSim", "EmptyEnvironmentPandaSim", "ObstacleAvoidanceMir100Sim")  # of each robot
+    env_ids = [importing_id(f"{NAMESPACE}/{name}-v0") for name in names]
     done = subprocess.run(
         ["xvfb-run", "-a", "-s", "-screen 0 1024x768x24", sys.executable, "-c", WINDOW, *env_ids],
         capture_output=True,
