@@ -49,17 +49,8 @@ def test_arguments_and_bundles_are_checked_before_anything_starts(
 
 
 @pytest.mark.serve
-def test_a_port_that_is_taken_is_named_with_its_holder(policies: Path) -> None:
-    with launched(policies) as run:
-        run.wait_until_ready()
-        with pytest.raises(UsageError, match=rf"port {run.port} on 127.0.0.1 is in use by '.*' \(process \d+\)"):
-            serve_policies([policies], port=run.port)
-        assert ask(run.port, "GET", "/v2/health/ready")[0] == 200
-
-
-@pytest.mark.serve
 @pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])  # SIGTERM ends `shipped_server` and `workers`
 def test_a_server_that_is_ended_leaves_nothing(policies: Path, number: signal.Signals, workers: int) -> None:
     # With one process nothing is left that could remove the key's file: the next server replaces it.
     with_key = workers > 1 or number != signal.SIGKILL
@@ -139,10 +130,18 @@ def test_few_open_files_are_a_warning_and_connections_wait(policies: Path) -> No
 @pytest.fixture(scope="module")
 def workers(policies: Path) -> Iterator[tuple[Run, Load]]:
     expected = Policy.load(policies / "ur5" / "10").act(OBS)
-    with launched(policies, workers=2) as run:
+    with launched(policies, workers=2, with_admin_key=True, with_grpc=True) as run:
         run.wait_until_ready()
         yield run, Load(run.port, "ur5", OBS, [np.asarray(expected)])
         assert run.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.serve
+def test_a_port_that_is_taken_is_named_with_its_holder(policies: Path, workers: tuple[Run, Load]) -> None:
+    run, _ = workers
+    with pytest.raises(UsageError, match=rf"port {run.port} on 127.0.0.1 is in use by '.*' \(process \d+\)"):
+        serve_policies([policies], port=run.port)
+    assert ask(run.port, "GET", "/v2/health/ready")[0] == 200
 
 
 def worker_pids(run: Run) -> list[int]:
@@ -260,17 +259,6 @@ def test_a_worker_that_dies_during_a_slow_replacement_is_replaced_too(policies: 
         os.kill(slow, signal.SIGCONT)
         wait_for(lambda: not before & set(now := worker_pids(run)) and len(now) == 2, "new workers", poll_s=0.2)
         assert run.end(signal.SIGTERM) == 0
-
-
-@pytest.mark.serve
-@pytest.mark.slow
-def test_workers_whose_parent_was_killed_end_themselves(policies: Path) -> None:
-    with launched(policies, workers=2) as run:
-        run.wait_until_ready()
-        left = worker_pids(run)
-        run.process.kill()
-        run.process.wait()
-        wait_for(lambda: not any(map(psutil.pid_exists, left)))
 
 
 @pytest.mark.serve
