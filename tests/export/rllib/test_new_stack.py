@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +13,7 @@ import onnx
 import pytest
 import torch
 
+from command_line import rlservo_here
 from rlservo.bundle.bundle import load_bundle
 from rlservo.bundle.contract import Contract
 from rlservo.bundle.nested import build_action
@@ -128,22 +126,19 @@ def test_distance_and_bearing_hold_for_extreme_observations(
 
 
 def test_an_operator_without_an_onnx_form_is_one_sentence_on_the_command_line(
-    wide_zoo: Path, app: Path, tmp_path: Path
+    wide_zoo: Path, app: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    changed_app = Path(shutil.copytree(app, tmp_path / "app", ignore=shutil.ignore_patterns("__pycache__")))
-    source = changed_app / "zoo_spaces.py"
-    source.write_text(source.read_text().replace("torch.hypot(x, y)", "torch.nextafter(x, y)"))
-    command = [sys.executable, "-m", "rlservo.deploy.cli", "export", str(wide_zoo / "polar")]
-    command += ["--out", str(tmp_path / "out"), "--app-dir", str(changed_app)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    monkeypatch.setattr(torch, "hypot", torch.nextafter)
+    done = rlservo_here("export", wide_zoo / "polar", "--out", tmp_path / "out", "--app-dir", app)
     assert done.returncode == 1
     (sentence,) = [line for line in done.stderr.splitlines() if line.startswith("rlservo: ")]
+    source = re.escape(str(app / "zoo_spaces.py"))
     assert re.fullmatch(
-        rf"rlservo: the operator torch\.nextafter in Polar\.torch_forward \({re.escape(str(source))}:\d+\) has no ONNX "
+        rf"rlservo: the operator torch\.nextafter in Polar\.torch_forward \({source}:\d+\) has no ONNX "
         r"form that onnxruntime runs: compose it of [\w ,.]+",
         sentence,
     )
-    written = done.stdout + done.stderr
+    written = done.stdout + done.stderr + "".join(capfd.readouterr())  # of libraries, too
     assert not any(words in written for words in ("\x1b", "Traceback", "Next steps", "step 3/3"))
     assert "the elements stay unnamed, which changes nothing else" in written
     assert not (tmp_path / "out").exists()
