@@ -126,6 +126,13 @@ class ByGroup(LoadScopeScheduling):
         return group_of(nodeid)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no other file where only tests in real time are chosen: the others' imports take each process seconds."""
+    place = collection_path.relative_to(Path(__file__).parents[1]).as_posix()
+    files = [beginning.partition("::")[0] for beginning in REAL_TIME if config.option.markexpr == "realtime"]
+    return None if not files or any(map(place.startswith, files)) or any(f.startswith(place) for f in files) else True
+
+
 @pytest.hookimpl(optionalhook=True)  # -p no:xdist
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByGroup:
     """Take the place of `--dist`: marks (loadgroup) do not reach xdist 3.8 under pytest 9.2."""
