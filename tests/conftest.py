@@ -51,6 +51,7 @@ TOGETHER = {
     "tests/envs/robot_server/": "ports of server managers",
     "tests/export/graph/test_operators.py": "torch's compiler",  # imports it
     "tests/export/sources/test_leapp.py": "torch's compiler",
+    "tests/export/sources/test_leapp_bundles.py": "torch's compiler",
     "tests/export/sources/test_rsl_rl.py": "torch's compiler",
     "tests/system/test_behind_nginx.py": "live server",
     "tests/system/test_prometheus.py": "live server",

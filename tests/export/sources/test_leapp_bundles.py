@@ -20,10 +20,17 @@ from rlservo.policy.policy import Policy
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
-leapp = pytest.importorskip("leapp")
+leapp: Any = None
 
 Trace = Callable[[], None]
 FORMATS = pytest.mark.parametrize("format", ["jit", "jit-trace", "onnx", "onnx-torchscript"])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def imported() -> None:
+    """Import LEAPP with the first test: it imports all of torch's compiler, which each process would when it starts."""
+    global leapp
+    leapp = pytest.importorskip("leapp")
 
 
 def compiled(folder: Path, trace: Trace) -> Path:
