@@ -181,11 +181,11 @@ class Repository:
             self._look_in_folders(listing)
             folder = self._seen.get((name, version, digest))
         if folder is not None:
-            self._check_signature(folder)
+            self._check_signature(folder, name, version, digest)
             yield folder
         elif self._storages:
             with self._cache.bundle(digest, partial(self._download, name, version, digest)) as fetched:
-                self._check_signature(fetched, f"{name}/{version}")
+                self._check_signature(fetched, name, version, digest, is_cached=True)
                 yield fetched
         else:
             listing.find(name, version)
@@ -196,18 +196,20 @@ class Repository:
         if self._storages:
             self._cache.touch(digests)
 
-    def _check_signature(self, folder: Path, remote: str = "") -> None:
-        """Check who signed a bundle; `remote` is the folder that one in the cache was fetched from."""
+    def _check_signature(self, folder: Path, name: str, version: str, digest: str, *, is_cached: bool = False) -> None:
+        """Check who signed the bundle with this hash, the one that the loader accepts afterwards."""
         if self._keys is None:
             return
         bundle = load_bundle(folder, self._limits)
+        if bundle.digest != digest:  # a signed one was put there for the moment of this check
+            raise exchanged(name, version, folder)
         try:
             signer = check_signature(bundle, self._keys)
         except BundleError:  # it may have been signed, or signed with another key, since
-            if not (remote and self._fetch_signature(folder, remote)):
+            if not (is_cached and self._fetch_signature(folder, f"{name}/{version}")):
                 raise
             signer = check_signature(bundle, self._keys)
-        logger.info("policy '%s' version %s: signed by %s", bundle.contract.name, bundle.contract.version, signer)
+        logger.info("policy '%s' version %s: signed by %s", name, version, signer)
 
     def _fetch_signature(self, folder: Path, remote: str) -> bool:
         """Replace the signature of a bundle in the cache by the published one; return whether there is one."""

@@ -20,7 +20,9 @@ import pytest
 from bundles import write_box_policy
 from command_line import rlservo, rlservo_here
 from rlservo.bundle.bundle import SUMS_FILE, Bundle, load_bundle
-from rlservo.errors import BundleError, ConflictError, UsageError
+from rlservo.errors import BundleError, BundleTamperedError, ConflictError, UsageError
+from rlservo.policy.policy import Policy
+from rlservo.serve_app.repository import repository
 from rlservo.serve_app.repository.publication import publish
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.repository.signature import SIGNATURE_FILE, check_signature, sign
@@ -259,6 +261,31 @@ def test_keys_are_changed_while_serving(tmp_path: Path) -> None:
             await load("4")
 
     asyncio.run(rotate())
+
+
+def test_a_signed_bundle_that_is_there_only_for_the_check_helps_no_other(
+    tmp_path: Path, bundle: Bundle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever writes into the folder exchanges it twice: before the signature is checked, and after that."""
+    sign(bundle, write(tmp_path, "team")[1])
+    signed, evil = bundle.path.rename(tmp_path / "signed"), write_box_policy(tmp_path / "evil", seed=5)
+    bundle.path.symlink_to(evil)
+    digest = load_bundle(evil).digest
+
+    def exchanging(there: Path, call: Callable[..., Any]) -> Callable[..., Any]:
+        def exchanged(*given: Any) -> Any:
+            bundle.path.unlink()
+            bundle.path.symlink_to(there)
+            return call(*given)
+
+        return exchanged
+
+    monkeypatch.setattr(repository, "load_bundle", exchanging(signed, load_bundle))
+    loader = VersionLoader(
+        Repository([tmp_path / "policies"], keys=tmp_path / "keys"), load=exchanging(evil, Policy.load)
+    )
+    with pytest.raises(BundleTamperedError, match=r"is not the bundle that was accepted as version 1 of 'ur5'"):
+        asyncio.run(loader.load(("ur5", "1", digest)))
 
 
 def test_a_signature_is_published_fetched_and_replaced(tmp_path: Path, bundle: Bundle, storage: Storage) -> None:
