@@ -11,7 +11,7 @@ import json
 import logging
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -77,7 +77,7 @@ def check_signature(bundle: Bundle, keys: Path) -> str:
     except OSError as error:
         raise BundleError(f"{file} cannot be read: {error.strerror or error}") from None
     try:
-        names, certificates = _contents(content)
+        names, fault = _contents(content)
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise BundleError(f"{file} is no signature of OpenSSF Model Signing by a key or a certificate") from None
     with _copy(bundle) as copy:
@@ -92,7 +92,7 @@ def check_signature(bundle: Bundle, keys: Path) -> str:
                 raise BundleError(f"{file} by {name} is for other files than these: {reason}") from None
             if SUMS_FILE not in names:  # the format allows this, and an expired certificate
                 raise BundleError(f"{file} by {name} leaves out {SUMS_FILE}, and with it the other files")
-            if fault := _not_valid(certificates):
+            if fault:
                 raise BundleError(f"{file} {fault}")
             return name
     raise BundleError(f"{file} is by none of the keys in {keys} ({', '.join(verifiers)})")
@@ -101,10 +101,12 @@ def check_signature(bundle: Bundle, keys: Path) -> str:
 def trusted(keys: Path) -> dict[str, Callable[[Path, Path], object]]:
     """Return a check of (files, signature) by file name, for each PEM file in a folder, or for one file.
 
-    A file holds one public key, or certificates of issuers; an expired one is left out. Raises UsageError.
+    A file holds one public key, or certificates of issuers; an expired one, or one for other uses, is left out. Raises
+    UsageError.
     """
     with needs_extra("sign"):
         from cryptography import x509
+        from cryptography.exceptions import UnsupportedAlgorithm
         from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePublicKey
         from cryptography.hazmat.primitives.serialization import load_pem_public_key
         from model_signing import verifying
@@ -116,7 +118,7 @@ def trusted(keys: Path) -> dict[str, Callable[[Path, Path], object]]:
             if b"PRIVATE KEY" in content:
                 raise UsageError(f"{file} holds a private key: {expected}")
             if b"BEGIN CERTIFICATE" in content:
-                if fault := _not_valid(x509.load_pem_x509_certificates(content)):
+                if fault := _fault_of(x509.load_pem_x509_certificates(content)):
                     logger.warning("%s %s: it is not used", file, fault)
                     continue
                 config = verifying.Config().use_certificate_verifier(certificate_chain=[file])
@@ -127,15 +129,15 @@ def trusted(keys: Path) -> dict[str, Callable[[Path, Path], object]]:
             checks[file.name] = config.verify
     except OSError as error:
         raise UsageError(f"{error.filename} cannot be read ({error.strerror}): {expected}") from None
-    except ValueError as error:
+    except (ValueError, UnsupportedAlgorithm) as error:
         raise UsageError(f"{file} holds no key ({str(error)[:100]}): {expected}") from None
     if not checks:
-        raise UsageError(f"{keys} holds no *.pem: {expected}")
+        raise UsageError(f"{keys} holds no *.pem that can be used: {expected}")
     return checks
 
 
-def _contents(signature: bytes) -> tuple[set[str], list[Any]]:
-    """Return (names of the files it covers, certificates) of a signature that no one has checked yet.
+def _contents(signature: bytes) -> tuple[set[str], str]:
+    """Return (names of the files it covers, fault of its certificates) of a signature that no one has checked yet.
 
     Whatever this and the library could read in two ways is refused. Raises ValueError and others.
     """
@@ -160,13 +162,23 @@ def _contents(signature: bytes) -> tuple[set[str], list[Any]]:
     chain = material["x509CertificateChain"]["certificates"] if "x509CertificateChain" in material else []
     statement = json.loads(decoded(parsed["dsseEnvelope"]["payload"]))
     names = {each["name"] for each in statement["predicate"]["resources"]}
-    return names, [x509.load_der_x509_certificate(decoded(each["rawBytes"])) for each in chain]
+    return names, _fault_of([x509.load_der_x509_certificate(decoded(each["rawBytes"])) for each in chain])
 
 
-def _not_valid(certificates: list[Any]) -> str:
-    """Return what is wrong with the first certificate that is not valid today, '' if there is none."""
+def _fault_of(certificates: list[Any]) -> str:
+    """Return why the first certificate that is not valid today, or is for other uses, cannot be used; '' if all can.
+
+    The library checks neither: without this a web server's certificate by the same issuer could sign.
+    """
+    from cryptography.x509 import ExtendedKeyUsage, ExtensionNotFound
+    from cryptography.x509.oid import ExtendedKeyUsageOID as Use
+
     now = datetime.now(timezone.utc)
     for each in certificates:
+        with suppress(ExtensionNotFound):
+            uses = each.extensions.get_extension_for_class(ExtendedKeyUsage).value
+            if not {Use.CODE_SIGNING, Use.ANY_EXTENDED_KEY_USAGE}.intersection(uses):
+                return f"has a certificate of {each.subject.rfc4514_string()[:80]!r} for other uses than code signing"
         if not each.not_valid_before_utc <= now <= each.not_valid_after_utc:
             return (
                 f"has a certificate of {each.subject.rfc4514_string()[:80]!r} that is valid from "

@@ -35,7 +35,7 @@ from storages import Storage
 pytest.importorskip("model_signing")
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from model_signing import hashing, signing
 
 DAY = datetime.timedelta(days=1)
@@ -56,7 +56,16 @@ def write(folder: Path, name: str, key: Key | None = None, curve: ec.EllipticCur
     return key, private
 
 
-def certificate(subject: str, key: Key, issuer: str, by: Key, days: tuple[int, int], *, is_ca: bool = False) -> bytes:
+def certificate(
+    subject: str,
+    key: Key,
+    issuer: str,
+    by: Key,
+    days: tuple[int, int],
+    *,
+    is_ca: bool = False,
+    uses: tuple[x509.ObjectIdentifier, ...] = (),
+) -> bytes:
     name = [x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, each)]) for each in (subject, issuer)]
     now = datetime.datetime.now(datetime.timezone.utc)
     unused = ("content_commitment", "key_encipherment", "data_encipherment", "key_agreement", "crl_sign")
@@ -71,9 +80,10 @@ def certificate(subject: str, key: Key, issuer: str, by: Key, days: tuple[int, i
         .not_valid_after(now + days[1] * DAY)
         .add_extension(x509.BasicConstraints(ca=is_ca, path_length=None), critical=True)
         .add_extension(x509.KeyUsage(digital_signature=not is_ca, key_cert_sign=is_ca, **usage), critical=True)
-        .sign(by, hashes.SHA256())
     )
-    return made.public_bytes(serialization.Encoding.PEM)
+    if uses:
+        made = made.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
+    return made.sign(by, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 
 @pytest.fixture
@@ -204,6 +214,32 @@ def test_an_issuer_stands_for_its_certificates_until_they_expire(tmp_path: Path,
             check_signature(bundle, issuers)
 
 
+def test_a_certificate_for_other_uses_signs_nothing(tmp_path: Path, bundle: Bundle) -> None:
+    """Such as that of a web server, which may be on many machines (RFC 5280, 4.2.1.12)."""
+    (issuer, _), (leaf, private) = write(tmp_path, "issuer"), write(tmp_path, "leaf")
+    use = x509.ExtendedKeyUsageOID
+    chain, folder = tmp_path / "chain", tmp_path / "trusted"
+    folder.mkdir()
+    (folder / "ca.pem").write_bytes(certificate("ca", issuer, "ca", issuer, (-9, 9), is_ca=True))
+    for given in ((use.CODE_SIGNING,), (use.SERVER_AUTH, use.ANY_EXTENDED_KEY_USAGE)):
+        chain.write_bytes(certificate("leaf", leaf, "ca", issuer, (-2, 2), uses=given))
+        sign(bundle, private, chain)
+        assert check_signature(bundle, folder) == "ca.pem"
+    web = certificate("web", leaf, "ca", issuer, (-2, 2), uses=(use.SERVER_AUTH, use.CLIENT_AUTH))
+    chain.write_bytes(web)
+    sign(bundle, private, chain)
+    with pytest.raises(BundleError, match=r"has a certificate of 'CN=web' for other uses than code signing"):
+        check_signature(bundle, folder)
+    between, _ = write(tmp_path, "between")  # an issuer of web servers' certificates issues no other
+    chain.write_bytes(
+        certificate("leaf", leaf, "between", between, (-2, 2))
+        + certificate("between", between, "ca", issuer, (-2, 2), is_ca=True, uses=(use.SERVER_AUTH,))
+    )
+    sign(bundle, private, chain)
+    with pytest.raises(BundleError, match=r"has a certificate of 'CN=between' for other uses"):
+        check_signature(bundle, folder)
+
+
 @pytest.mark.parametrize("content", [b"", b"{}", b"[]", b"\xff", b"[" * 100_000, b'{"verificationMaterial": 3}'])
 def test_what_is_no_signature_is_said(tmp_path: Path, bundle: Bundle, content: bytes) -> None:
     write(tmp_path, "team")
@@ -222,6 +258,12 @@ def test_keys_that_cannot_be_used_are_named(tmp_path: Path, bundle: Bundle) -> N
         check_signature(bundle, keys)
     (keys / "mine.pem").write_text("-----BEGIN PUBLIC KEY-----\nAAAA\n-----END PUBLIC KEY-----\n")
     with pytest.raises(UsageError, match=r"mine\.pem holds no key"):
+        check_signature(bundle, keys)
+    unknown = ed25519.Ed25519PrivateKey.generate().public_key()
+    der = unknown.public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+    text = base64.b64encode(der.replace(b"\x2b\x65\x70", b"\x2b\x65\x7f")).decode()  # an algorithm of the future
+    (keys / "mine.pem").write_text(f"-----BEGIN PUBLIC KEY-----\n{text}\n-----END PUBLIC KEY-----\n")
+    with pytest.raises(UsageError, match=r"mine\.pem holds no key \(Unknown key type"):
         check_signature(bundle, keys)
     for folder in (tmp_path / "none", tmp_path / "policies"):
         with pytest.raises(UsageError, match=r"expected public elliptic keys"):
