@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.bundle.contract import REWARD, Contract
+from rlservo.bundle.contract import Contract
 from rlservo.deploy.cockpit.ghost import Ghost
 from rlservo.deploy.cockpit.policies import Choice, PolicySource, ServerLink
 from rlservo.deploy.cockpit.stage import Stage, StageDisturbance, Vector, home_arguments, home_of
 from rlservo.deploy.cockpit.view import Cycle, Phase, View
+from rlservo.drive.driven_episode import reward_input
 from rlservo.drive.fallback import StoppedError, WithFallback
 from rlservo.drive.success import success_of
 from rlservo.envs.rendering import Start
@@ -305,9 +306,7 @@ class Drive:
 
     def _act(self) -> Any:
         self._contract = self._policy.contract  # which asks a server again where an alias may have moved
-        has_reward = any(tensor.name == REWARD for tensor in self._contract.inputs)
-        reward: dict[str, Any] = {REWARD: self._reward} if has_reward else {}
-        return self._acting.act(self._obs, **reward)
+        return self._acting.act(self._obs, **reward_input(self._contract, self._reward))
 
     def _show_robot(self, robot: Mapping[str, Any] | None) -> None:
         """Show the state of a real robot."""

@@ -26,7 +26,7 @@ from rlservo.deploy.ros2.mapped_elements import (
 )
 from rlservo.deploy.ros2.parameters import MAPPED
 from rlservo.deploy.ros2.targets import GivenTarget, Targets
-from rlservo.drive.driven_episode import report_step
+from rlservo.drive.driven_episode import report_step, reward_input
 from rlservo.drive.environment_fit import check_fit
 from rlservo.drive.make_environment import make_env
 from rlservo.drive.real_robot_gate import check_proven
@@ -322,10 +322,10 @@ def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target:
         return
     targets.begun = number
     policy.reset()
-    is_first = True
+    contract, reward, is_first = policy.contract, 0.0, True
     while not robot.is_called_off() and targets.newest is target:
         try:
-            action = policy.act(observation)
+            action = policy.act(observation, **reward_input(contract, reward))
         except RlservoError as error:
             node.enter("holding", error.message)
             node.counts["late"] += 1
@@ -336,7 +336,7 @@ def _drive_to(node: PolicyNode, env: Any, option: str, targets: Targets, target:
         is_first = False
         step = env.step(action)
         report_step(policy, step)
-        observation, _, terminated, truncated, info = step
+        observation, reward, terminated, truncated, info = step
         node.counts["decisions"] += 1
         targets.tell(target, *_whereabouts(env.unwrapped, is_arm))
         state, blocked = info["robot"]["state"], info["robot"].get("blocked", "")

@@ -62,7 +62,7 @@ def run_episode(
     Raises UsageError when the environment fails, StoppedError when its robot waits for a person, and whatever
     `policy.act` raises, preceded by episode and step.
     """
-    has_reward = policy.contract.has_reward
+    contract = policy.contract
     draws = np.random.default_rng(seed)  # one seed per exploratory action; unused otherwise
     policy.reset()
     obs, _ = _call(env.reset, index, 0, seed=seed)
@@ -70,9 +70,8 @@ def run_episode(
     info: Mapping[str, Any] = {}
     while not is_over:
         action_seed = int(draws.integers(2**31)) if explore else None
-        reward_input = {REWARD: reward} if has_reward else {}
         try:
-            action = policy.act(obs, explore=explore, seed=action_seed, **reward_input)
+            action = policy.act(obs, explore=explore, seed=action_seed, **reward_input(contract, reward))
         except RlservoError as error:
             error.prefix(f"episode {index}, step {steps}")
             raise
@@ -81,6 +80,11 @@ def run_episode(
         total += reward
     status = info.get("final_status")
     return DrivenEpisode(index, seed, steps, total, success_of(info), None if status is None else str(status))
+
+
+def reward_input(contract: Contract, reward: float) -> dict[str, Any]:
+    """Return the reward of the last action as an argument of `act`, if the policy was trained to see it."""
+    return {REWARD: reward} if contract.has_reward else {}
 
 
 def report_step(policy: Any, step: tuple[Any, Any, bool, bool, dict[str, Any]]) -> None:
