@@ -22,7 +22,7 @@ from rlservo.errors import BundleError, ConflictError, UnavailableError, UsageEr
 from rlservo.serve_app.repository.hub_storage import HubStorage
 from rlservo.serve_app.repository.index import INDEX, Index, check_file_type
 from rlservo.serve_app.repository.places import place_of
-from rlservo.serve_app.repository.signature import MAX_SIGNATURE_BYTES, SIGNATURE_FILE
+from rlservo.serve_app.repository.signature import MAX_SIGNATURE_BYTES, SIGNATURE_FILE, read_signature
 from rlservo.serve_app.repository.storage import FolderStorage, storage_at
 
 if TYPE_CHECKING:
@@ -53,8 +53,10 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
             {f"{bundle.contract.name}/{bundle.contract.version}/{f}": copy for f, copy in _files(bundle)}, card
         )
     index, tag = Index.read(storage)
-    if index.hash_of(bundle) == bundle.digest and (bundle.path / SIGNATURE_FILE).exists():
-        _publish_signature(storage, bundle, target)
+    is_signed = (bundle.path / SIGNATURE_FILE).exists()
+    if index.hash_of(bundle) == bundle.digest and is_signed:
+        if not _put_signature(storage, bundle):
+            raise ConflictError(f"{target} is there already (this very bundle, with this signature)")
         return storage.pinned if isinstance(storage, HubStorage) else target
     content = _with(index, bundle, target)
     if isinstance(storage, FolderStorage):
@@ -62,11 +64,14 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
     elif not is_hub:  # its files come with the index, in one commit
         for file, copy in _files(bundle):
             progress(f"{target}/{file}")
-            if not storage.create(f"{bundle.contract.name}/{bundle.contract.version}/{file}", copy):
+            is_there = storage.create(f"{bundle.contract.name}/{bundle.contract.version}/{file}", copy)
+            if not is_there and file != SIGNATURE_FILE:
                 raise ConflictError(
                     f"{target}/{file} holds a different file from {bundle.path / file}: the version is being "
                     "published by another command, or was left unfinished; publish it as another one (--version next)"
                 )
+    if is_signed and not is_hub:  # an interrupted try may have left another one, or none
+        _put_signature(storage, bundle)
     for attempt in range(ATTEMPTS):
         if storage.create(INDEX, content, tag):
             return storage.pinned if isinstance(storage, HubStorage) else target
@@ -78,19 +83,17 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
     raise UnavailableError(f"{storage.uri}/{INDEX}: others keep publishing; run the same command again")
 
 
-def _publish_signature(storage: ObjectStorage | HubStorage | FolderStorage, bundle: Bundle, target: str) -> None:
-    """Publish the signature of a bundle that is published: the first one, or one by another key.
-
-    Raises ConflictError if that very one is published, and what `publish` raises.
-    """
-    name = f"{bundle.contract.name}/{bundle.contract.version}/{SIGNATURE_FILE}"
-    signature, there, tag = (bundle.path / SIGNATURE_FILE).read_bytes(), b"", ""
+def _put_signature(storage: ObjectStorage | HubStorage | FolderStorage, bundle: Bundle) -> bool:
+    """Write the signature of a bundle; return False if it is there already. Raises UnavailableError, BundleError."""
+    signature = read_signature(bundle.path)
+    name, there, tag = f"{bundle.contract.name}/{bundle.contract.version}/{SIGNATURE_FILE}", b"", ""
     with contextlib.suppress(FileNotFoundError):
         there, tag = storage.read(name, MAX_SIGNATURE_BYTES)
     if there == signature:
-        raise ConflictError(f"{target} is there already (this very bundle, with this signature)")
+        return False
     if not storage.create(name, signature, tag):
-        raise UnavailableError(f"{target}/{SIGNATURE_FILE}: others keep publishing; run the same command again")
+        raise UnavailableError(f"{storage.uri}/{name}: others keep publishing; run the same command again")
+    return True
 
 
 def next_version(place: str, name: str) -> str:
@@ -111,7 +114,7 @@ def _files(bundle: Bundle) -> Iterator[tuple[str, bytes]]:
             raise BundleError(f"{bundle.path / name} changed while it was published")
         yield name, content
     with contextlib.suppress(FileNotFoundError):
-        yield SIGNATURE_FILE, (bundle.path / SIGNATURE_FILE).read_bytes()
+        yield SIGNATURE_FILE, read_signature(bundle.path)
 
 
 def _with(index: Index, bundle: Bundle, target: str) -> bytes:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import logging
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -51,12 +52,31 @@ def sign(bundle: Bundle, key: Path, certificate: Path | None = None) -> Path:
         ) from None
     config.set_hashing_config(hashing.Config().set_ignored_paths(paths=[], ignore_git_paths=False))
     with _copy(bundle) as copy:
-        config.sign(copy, beside := copy.with_name(SIGNATURE_FILE))
+        config.sign(copy, made := copy.parent.with_name(SIGNATURE_FILE))
         file = bundle.path / SIGNATURE_FILE
-        new = file.with_name(f".{SIGNATURE_FILE}.new")
-        new.write_bytes(beside.read_bytes())
-        new.replace(file)
+        with tempfile.TemporaryDirectory(prefix=".signature-", dir=bundle.path) as beside:  # no one's link is there
+            shutil.copyfile(made, new := Path(beside) / SIGNATURE_FILE)
+            new.replace(file)
     return file
+
+
+def read_signature(folder: Path) -> bytes:
+    """Return the content of a bundle's signature, unchecked except that it is one.
+
+    Raises FileNotFoundError, and BundleError for anything else, such as a link to a file that is not to be published.
+    """
+    file = folder / SIGNATURE_FILE
+    try:
+        with open_regular(file, MAX_SIGNATURE_BYTES) as stream:
+            content = b"".join(blocks(stream, MAX_SIGNATURE_BYTES))
+        _contents(content)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise BundleError(f"{file} cannot be read: {error.strerror or error}") from None
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise BundleError(f"{file} is no signature of OpenSSF Model Signing by a key or a certificate") from None
+    return content
 
 
 def check_signature(bundle: Bundle, keys: Path) -> str:
@@ -66,22 +86,22 @@ def check_signature(bundle: Bundle, keys: Path) -> str:
     hashes `load_bundle` compared, so a bundle with this `digest` is what was signed. Raises BundleError, UsageError.
     """
     verifiers = trusted(keys)
+    from cryptography import x509
+
     file = bundle.path / SIGNATURE_FILE
     try:
-        with open_regular(file, MAX_SIGNATURE_BYTES) as stream:
-            content = b"".join(blocks(stream, MAX_SIGNATURE_BYTES))
+        content = read_signature(bundle.path)
     except FileNotFoundError:
         raise BundleError(
             f"{bundle.path} has no {SIGNATURE_FILE}: expected a signature by a key of {keys} (`rlservo sign`)"
         ) from None
-    except OSError as error:
-        raise BundleError(f"{file} cannot be read: {error.strerror or error}") from None
+    names, certificates = _contents(content)
     try:
-        names, fault = _contents(content)
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        raise BundleError(f"{file} is no signature of OpenSSF Model Signing by a key or a certificate") from None
+        fault = _fault_of([x509.load_der_x509_certificate(each) for each in certificates])
+    except ValueError as error:
+        fault = f"has a malformed certificate ({str(error)[:100]})"
     with _copy(bundle) as copy:
-        (beside := copy.with_name(SIGNATURE_FILE)).write_bytes(content)
+        (beside := copy.parent.with_name(SIGNATURE_FILE)).write_bytes(content)
         for name, verify in verifiers.items():
             try:
                 verify(copy, beside)
@@ -136,12 +156,11 @@ def trusted(keys: Path) -> dict[str, Callable[[Path, Path], object]]:
     return checks
 
 
-def _contents(signature: bytes) -> tuple[set[str], str]:
-    """Return (names of the files it covers, fault of its certificates) of a signature that no one has checked yet.
+def _contents(signature: bytes) -> tuple[set[str], list[bytes]]:
+    """Return (names of the files it covers, certificates as DER) of a signature that no one has checked yet.
 
     Whatever this and the library could read in two ways is refused. Raises ValueError and others.
     """
-    from cryptography import x509
 
     def fields(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         named = dict(pairs)
@@ -162,7 +181,7 @@ def _contents(signature: bytes) -> tuple[set[str], str]:
     chain = material["x509CertificateChain"]["certificates"] if "x509CertificateChain" in material else []
     statement = json.loads(decoded(parsed["dsseEnvelope"]["payload"]))
     names = {each["name"] for each in statement["predicate"]["resources"]}
-    return names, _fault_of([x509.load_der_x509_certificate(decoded(each["rawBytes"])) for each in chain])
+    return names, [decoded(each["rawBytes"]) for each in chain]
 
 
 def _fault_of(certificates: list[Any]) -> str:
@@ -191,9 +210,9 @@ def _fault_of(certificates: list[Any]) -> str:
 def _copy(bundle: Bundle) -> Iterator[Path]:
     """Give a private folder with the bundle's files, and nothing else, whose hashes were compared."""
     with tempfile.TemporaryDirectory(prefix="rlservo-signature-") as name:
-        folder = Path(name) / bundle.contract.name
-        folder.mkdir()
+        folder = Path(name) / "signed" / bundle.contract.name  # which may be that of the signature
+        folder.mkdir(parents=True)
         for file in (SUMS_FILE, *bundle.sums):
             with bundle.verified_copy(file) as copy:
-                (folder / file).write_bytes(copy.read_bytes())
+                shutil.copyfile(copy, folder / file)
         yield folder

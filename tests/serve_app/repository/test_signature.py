@@ -362,6 +362,44 @@ def test_a_signature_is_published_fetched_and_replaced(tmp_path: Path, bundle: B
         assert check_signature(load_bundle(folder), tmp_path / "keys") == "renamed.pem"
 
 
+def test_links_in_a_bundle_neither_overwrite_nor_publish_a_file(tmp_path: Path, bundle: Bundle) -> None:
+    """A bundle may come from anyone: signing it must not write to, and publishing it not read, what a link names."""
+    mine = tmp_path / "mine"
+    mine.write_text("secret")
+    for name in (".model.sig.new", SIGNATURE_FILE):
+        (bundle.path / name).symlink_to(mine)
+    with pytest.raises(BundleError, match=r"model\.sig is no signature"):
+        publish(bundle, str(tmp_path / "published"))
+    assert not list((tmp_path / "published").rglob(SIGNATURE_FILE))
+    file = sign(bundle, write(tmp_path, "team")[1])
+    assert mine.read_text() == "secret" and not file.is_symlink()
+    assert check_signature(bundle, tmp_path / "keys") == "team.pem"
+
+
+def test_a_policy_named_as_the_signature_is_signed(tmp_path: Path) -> None:
+    bundle = load_bundle(write_box_policy(tmp_path / "policies", name=SIGNATURE_FILE))
+    sign(bundle, write(tmp_path, "team")[1])
+    assert check_signature(bundle, tmp_path / "keys") == "team.pem"
+
+
+def test_an_interrupted_publication_is_completed_with_the_signature_made_since(
+    tmp_path: Path, bundle: Bundle, storage: Storage
+) -> None:
+    _, private = write(tmp_path, "team")
+    for place in (str(tmp_path / "published"), storage.uri):
+        (bundle.path / SIGNATURE_FILE).unlink(missing_ok=True)
+        for _ in range(2):  # first without a signature, then with another one
+            publish(bundle, place)
+            if place == storage.uri:
+                storage.change("DELETE", "index.json")
+            else:
+                (tmp_path / "published" / "index.json").unlink()
+            sign(bundle, private)
+        publish(bundle, place)
+        with pytest.raises(ConflictError, match="with this signature"):
+            publish(bundle, place)
+
+
 def test_the_commands_sign_and_require(tmp_path: Path, bundle: Bundle) -> None:
     (_, private), keys = write(tmp_path, "team"), tmp_path / "keys"
     served = ("serve", tmp_path / "policies", "--port", 0, "--require-signature", keys)
