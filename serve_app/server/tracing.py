@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 
 from rlservo.extras import needs_extra
 from rlservo.serve_app.server.logs import OK
 from rlservo.serve_app.sessions.request import TRACEPARENT, Request
+
+CLOSE_S = 2.0  # [s]
 
 
 class Tracing:
@@ -50,5 +53,7 @@ class Tracing:
         span.end(end)
 
     def close(self) -> None:
-        """Send what has not been sent."""
-        self._provider.shutdown()
+        """Send what has not been sent, unless the collector takes longer: it must not hold up the end."""
+        sending = threading.Thread(target=self._provider.shutdown, daemon=True)
+        sending.start()
+        sending.join(CLOSE_S)
