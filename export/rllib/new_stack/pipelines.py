@@ -147,10 +147,11 @@ class MultiAgentPipelines(Pipelines):
         for agent in others:
             spaces[agent].seed(0)
             other = TorchRLModule(observation_space=spaces[agent], model_config={})
-            among.connector_module.add_module(among._module_of(agent), other)
+            among.connector_module.add_module(among.module_of(agent), other)
         return among
 
-    def _module_of(self, agent: Any) -> str:
+    def module_of(self, agent: Any) -> str:
+        """Return the id of an agent's module."""
         module = self.slot.module  # instead of the mapping: the slot's module is already known
         return module if agent == self.slot.agent else f"{module}_{self.company.index(agent)}"
 
@@ -176,7 +177,7 @@ class MultiAgentPipelines(Pipelines):
         episode = MultiAgentEpisode(
             observation_space=self.env_to_module.input_observation_space,
             action_space=self.env_to_module.input_action_space,
-            agent_to_module_mapping_fn=lambda agent, _episode: self._module_of(agent),
+            agent_to_module_mapping_fn=lambda agent, _episode: self.module_of(agent),
         )
         observations = {self.slot.agent: obs, **self._drawn(episode.observation_space)}
         episode.add_env_reset(observations=observations, infos={agent: NoInfo() for agent in observations})

@@ -309,7 +309,14 @@ def _check_agents(files: CheckpointFiles, pipelines: Any, start_loop: Callable[[
         loop.pipelines = changed.fresh()
     for batch in [batch for batch in draw_batches(loops[0].recipe, seed=0) if len(batch) == 1][:AGENT_STEPS]:
         restart = np.ones(1, np.bool_) if batch.restart is None else batch.restart
-        first, *others = (loop.step(batch.inputs, restart) for loop in loops)
+        try:
+            first, *others = (loop.step(batch.inputs, restart) for loop in loops)
+        except UnsupportedError:
+            raise
+        except Exception as error:  # the user's own connectors may raise anything
+            raise UnsupportedError(
+                f"{files.root}: a connector of your own fails for another agent, or beside one: {first_line(error)}"
+            ) from error
         same = [
             all(np.allclose(outputs[name], first[name], 1e-4, 1e-5, equal_nan=True) for name in first)
             for outputs in others
