@@ -157,11 +157,12 @@ def _decode(action: Any, batch: tuple[int, ...], chunk: tuple[int, ...], contrac
             fault = f"is {str(leaf)[:80]}, expected numbers"
         elif array.shape != shape:
             fault = f"has shape {array.shape}, expected {shape}"
-        elif not is_finite(array):
-            fault = "has an element that is not finite"
         else:
-            converted = array.astype(spec.dtype)
-            if converted.dtype.kind in "iu" and not np.array_equal(converted, array):
+            with np.errstate(over="ignore", invalid="ignore"):  # whatever becomes of it is refused
+                converted = array.astype(spec.dtype)
+            if not is_finite(converted):
+                fault = f"has an element that is not finite in {spec.dtype}"
+            elif converted.dtype.kind in "iu" and not np.array_equal(converted, array):
                 fault = f"is {str(leaf)[:80]}, expected {spec.dtype}"
         if fault:
             raise ActionError(f"the server's {name} for {contract.name!r} {fault}")

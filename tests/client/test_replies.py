@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from rlservo.bundle.bundle import read_contract
 from rlservo.client.http_transport import BrokenError  # noqa: F401 - one that inherits its code
-from rlservo.client.replies import decode_error, error_of
+from rlservo.client.replies import decode_action, decode_error, error_of
 from rlservo.errors import (
+    ActionError,
     DeadlineError,
     OverloadedError,
     RequestError,
@@ -49,3 +53,13 @@ def test_lack_of_state_is_a_bad_request_with_details_on_the_wire() -> None:
 def test_without_a_code_of_ours_the_status_says_what_it_is(status: int, kind: type[RlservoError]) -> None:
     assert type(decode_error("http://host", status, b"<html>")) is kind
     assert error_of({"detail": "somebody else's"}, status) is None
+
+
+@pytest.mark.parametrize("element", [1e300, -1e39, float("nan"), float("inf")])
+def test_an_action_that_is_not_finite_in_the_spaces_type_is_refused(ur5: Path, element: float) -> None:
+    contract = read_contract(ur5)
+    given: dict[str, Any] = {"action": [0.0] * 5 + [element]}
+    with pytest.raises(ActionError, match="'ur5' has an element that is not finite in float32"):
+        decode_action(given, (), contract)
+    given["action"][5] = 1.5
+    assert decode_action(given, (), contract).tolist() == given["action"]
