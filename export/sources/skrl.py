@@ -178,11 +178,13 @@ class _SkrlReference:
             raise CheckpointError(f"{agent_file} cannot be read by skrl: expected plain YAML")
         config["agent"] = {name: value for name, value in config["agent"].items() if not _explores(name)}
         self._agent = _agent(file, config, layout)
-        self._role, self._choices = layout.role, layout.choices
+        self._role, self._choices, self._states = layout.role, layout.choices, layout.states
         self._process = process_actions(environment, joint_order, None)
 
     def __call__(self, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
-        actions, outputs = self._agent.act(obs, None, timestep=0, timesteps=1)
+        # A value function may take states, whatever they are.
+        states = obs.new_zeros((len(obs), self._states)) if self._states else None
+        actions, outputs = self._agent.act(obs, states, timestep=0, timesteps=1)
         if self._choices is None:
             return self._process(outputs.get("mean_actions", actions)), state
         model = self._agent.models[self._role]
@@ -234,6 +236,8 @@ def _layout(file: Path, agent_file: Path, config: Mapping[str, Any], weights: Ma
     if not kind.startswith(("Gaussian", "Deterministic", "Categorical")):
         raise UnsupportedError(f"{file}: its {role} is a {kind or 'model without a class'}: GaussianMixin, "
                                "DeterministicMixin and CategoricalMixin are exported")  # fmt: skip
+    if any("STATES" in str(network.get("input")) for network in _networks(model)):
+        raise UnsupportedError(f"{file}: its {role} takes STATES, which only a simulator has: train it on OBSERVATIONS")
     if model.get("clip_mean_actions") or (model.get("clip_actions") and kind.startswith("Deterministic")):
         raise UnsupportedError(f"{file}: its policy clips to the action space, whose bounds are in no file of the run: "
                                "give the model to rlservo.export_policy")  # fmt: skip
@@ -248,6 +252,8 @@ def _layout(file: Path, agent_file: Path, config: Mapping[str, Any], weights: Ma
     if kind.startswith("Categorical"):
         choices = "log_probabilities" if model.get("unnormalized_log_prob", True) else "probabilities"
     states = _scaled(weights, "state_preprocessor")
+    for other in [] if states else models:  # such as a critic of its own
+        states = states or _width(models[other], weights, other, "STATES")
     return _Layout(role, _observed(file, model, weights, role), states, actions, choices)
 
 
@@ -255,17 +261,31 @@ def _observed(file: Path, model: Mapping[str, Any], weights: Mapping[str, Any], 
     """Return the number of elements of an observation: those that are scaled, or that a network takes whole."""
     if scaled := _scaled(weights, "observation_preprocessor"):
         return scaled
-    networks = model.get("network")
-    for network in networks if isinstance(networks, list) else []:
-        if isinstance(network, Mapping) and str(network.get("input")).strip() == "OBSERVATIONS":
-            prefix = f"{network.get('name')}_container."
-            first: Any = next((weight for name, weight in weights[role].items() if str(name).startswith(prefix)), None)
-            if getattr(first, "ndim", 0) == 2:
-                return int(first.shape[1])
+    if width := _width(model, weights, role, "OBSERVATIONS"):
+        return width
     raise UnsupportedError(
         f"{file}: no network of its {role} takes all of OBSERVATIONS, and no preprocessor scales them: the number of "
         "elements of an observation is in no file of the run; give the model to rlservo.export_policy"
     )
+
+
+def _width(model: Any, weights: Mapping[str, Any], role: str, what: str) -> int | None:
+    """Return the number of elements of OBSERVATIONS or STATES, if a network of the model takes all of them."""
+    own = weights.get(role)
+    if not isinstance(own, Mapping):
+        return None
+    for network in _networks(model):
+        if str(network.get("input")).strip() == what:
+            prefix = f"{network.get('name')}_container."
+            first: Any = next((weight for name, weight in own.items() if str(name).startswith(prefix)), None)
+            if getattr(first, "ndim", 0) == 2:
+                return int(first.shape[1])
+    return None
+
+
+def _networks(model: Any) -> list[Mapping[str, Any]]:
+    networks = model.get("network") if isinstance(model, Mapping) else None
+    return [each for each in networks if isinstance(each, Mapping)] if isinstance(networks, list) else []
 
 
 def _unbounded(size: int) -> Box:

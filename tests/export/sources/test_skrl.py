@@ -70,13 +70,17 @@ def off_policy(algorithm: str, roles: dict[str, dict[str, Any]], **changes: Any)
 class World(gymnasium.Env[Any, Any]):
     """An environment whose observations are random, to train in."""
 
-    def __init__(self, action_space: Any) -> None:
+    def __init__(self, action_space: Any, states: int | None = None) -> None:
         self.observation_space = Box(-np.inf, np.inf, (SEEN,), np.float32)
         self.action_space = action_space
+        self.state_space = None if states is None else Box(-np.inf, np.inf, (states,), np.float32)
         self._rng = np.random.default_rng(3)
 
     def _observe(self) -> Any:
         return (1 + 2 * self._rng.standard_normal(SEEN)).astype(np.float32)
+
+    def state(self) -> Any:
+        return None if self.state_space is None else self._rng.random(self.state_space.shape, np.float32)
 
     def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
         return self._observe(), {}
@@ -85,7 +89,7 @@ class World(gymnasium.Env[Any, Any]):
         return self._observe(), -float(np.square(action).sum()), bool(self._rng.random() < 0.1), False, {}
 
 
-def train(folder: Path, settings: dict[str, Any], action_space: Any) -> Any:
+def train(folder: Path, settings: dict[str, Any], action_space: Any, states: int | None = None) -> Any:
     """Return a trained agent whose weights and settings are saved in `folder`, as Isaac Lab leaves them."""
     from skrl.envs.wrappers.torch import wrap_env
     from skrl.utils.runner.torch import Runner
@@ -95,7 +99,7 @@ def train(folder: Path, settings: dict[str, Any], action_space: Any) -> Any:
     (folder / "params" / "agent.yaml").write_text(yaml.dump(settings, sort_keys=False))
     training = copy.deepcopy(settings)
     training["agent"]["experiment"]["directory"] = str(folder)
-    runner = Runner(wrap_env(World(action_space), wrapper="gymnasium", verbose=False), training)
+    runner = Runner(wrap_env(World(action_space, states), wrapper="gymnasium", verbose=False), training)
     runner.run()
     with torch.no_grad():
         for model in runner.agent.models.values():
@@ -144,6 +148,32 @@ def test_the_scaler_and_the_environments_scale_are_baked_in(tmp_path: Path, noti
     assert [(e.name, e.unit) for e in contract.action_space.elements] == [("lift", "rad/s"), ("pan", "rad/s")]
     assert (contract.provenance.algorithm, contract.provenance.env_steps) == ("PPO", 500 * 64)
     assert "expressions that skrl evaluates" in notices[0]
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_a_critic_may_see_more_than_the_policy(tmp_path: Path, scaled: bool) -> None:
+    """Isaac Lab's `state_space`: the value function's own input, whose size only its weights have."""
+    settings = config()
+    settings["models"]["value"]["network"] = [{"name": "net", "input": "STATES", "layers": [8], "activations": "elu"}]
+    if scaled:
+        settings["agent"] |= {"state_preprocessor": "RunningStandardScaler", "state_preprocessor_kwargs": None}
+    agent = train(tmp_path / "run", settings, Box(-1, 1, (2,), np.float32), 7)
+    result = export_checkpoint(tmp_path / "run", tmp_path / "out", name="arm", notify=lambda _: None)
+    obs = observations()
+    with torch.no_grad():
+        wanted = agent.act(obs, torch.rand(20, 7), timestep=0, timesteps=0)[1]["mean_actions"].numpy()
+    with Policy.load(result.path) as policy:
+        np.testing.assert_allclose([policy.act(one.numpy()) for one in obs], wanted, rtol=1e-5, atol=2e-6)
+
+
+def test_a_policy_that_sees_the_critics_state_is_refused(tmp_path: Path) -> None:
+    settings = config()
+    settings["models"]["policy"]["network"] = [
+        {"name": "net", "input": "concatenate([OBSERVATIONS, STATES])", "layers": [8], "activations": "elu"}
+    ]
+    settings["models"]["value"]["network"] = [{"name": "net", "input": "STATES", "layers": [8], "activations": "elu"}]
+    train(tmp_path / "run", settings, Box(-1, 1, (2,), np.float32), 7)
+    refuse(tmp_path / "run", "its policy takes STATES, which only a simulator has", UnsupportedError)
 
 
 def test_actions_without_an_environments_file_have_no_bounds(tmp_path: Path, notices: list[str]) -> None:
@@ -238,7 +268,7 @@ def test_a_network_on_part_of_the_observation_has_the_whole_ones_size(tmp_path: 
     result = export_checkpoint(tmp_path / "run", tmp_path / "out", name="arm", notify=notices.append)
     obs = observations()
     with torch.no_grad():
-        wanted = agent.act(obs, None, timestep=0, timesteps=0)[1]["mean_actions"].numpy()
+        wanted = agent.act(obs, torch.rand(20, 7), timestep=0, timesteps=0)[1]["mean_actions"].numpy()
     with Policy.load(result.path) as policy:
         np.testing.assert_allclose([policy.act(one.numpy()) for one in obs], wanted, rtol=1e-5, atol=2e-6)
     del settings["agent"]["observation_preprocessor"]  # without it no file has the size
