@@ -215,9 +215,9 @@ class Rule:
         elif isinstance(getattr(policy, "quantile_net", None), nn.Module):
             mode, names, scored_by = "argmax", (Q_VALUES,), "quantile_net"
         if distribution is None:
-            notify(f"a {type(policy).__name__} on {space} is exported without exploring actions")
+            notify(f"{type(policy).__name__} on {space} is exported without exploring actions")
         if value and recurrent:
-            notify("the value head has a memory of its own, which predict does not carry: the export has no 'value'")
+            notify("predict carries no memory for a recurrent policy's value: the export has no 'value'")
         elif value and hasattr(policy, "predict_values"):
             names = (*names, "value")
         return Rule(mode, transform, distribution, names, scored_by if mode != "given" else "", recurrent, masked)
