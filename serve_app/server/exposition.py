@@ -52,6 +52,8 @@ def versions(handler: RequestHandler) -> None:
     if plan is None or store is None:
         return
     show.gauge("rlservo_plan_generation", "Number of the plan that this process follows", plan.generation)
+    missing = "Versions of the plan that this process could not load: it serves older ones, or none"
+    show.gauge("rlservo_versions_missing", missing, len(handler.control.behind))
     for policy in store.policies:
         name, version = policy.contract.name, policy.contract.version
         which, is_default = {"policy": name, "version": version}, version == store.default(name)

@@ -13,11 +13,14 @@ import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
 from rlservo.serve_app.protocols.asgi_app import create_app
+from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.server.exposition import exposition
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import Load, Unload
+from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.version_loader import VersionLoader
 from servers import exchange
 from stores import control_of, load_store
 
@@ -105,6 +108,22 @@ def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
         assert loaded() == {"1": 1.0}
         asyncio.run(control.give(Load(version="2"), "ur5"))
         assert loaded() == {"1": 1.0, "2": 0.0}
+
+
+def test_versions_that_a_process_could_not_load_are_counted(box_policy: Any, controlled: Any, tmp_path: Path) -> None:
+    for version in ("1", "2"):
+        box_policy(tmp_path, version=version)
+    config = {"policies": {"ur5": {"aliases": {"production": "1"}}}}
+    with controlled(tmp_path, config=config) as control:
+        for damaged in (0, 1):
+            if damaged:  # another process begins, with the same plan
+                (tmp_path / "ur5" / "2" / "policy.onnx").write_bytes(b"")
+                control = PlanFollower(VersionLoader(Repository([tmp_path])), control.files)
+                asyncio.run(control.configure(config))
+            text = asyncio.run(exposition(RequestHandler(control, ServerSettings()))).decode()
+            families = {family.name: family for family in text_string_to_metric_families(text)}
+            assert families["rlservo_versions_missing"].samples[0].value == damaged
+            assert len(families["rlservo_policy_loaded"].samples) == 2 - damaged
 
 
 def test_a_counter_whose_source_begins_again_goes_on() -> None:
