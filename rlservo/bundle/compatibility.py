@@ -37,7 +37,7 @@ def interface_differences(contract: Contract, known: Contract) -> str:
 
 
 def harmless_differences(contract: Contract, known: Contract) -> str:
-    """Return what else differs for a client, with both values: names, units and the control rate; empty for nothing."""
+    """Return what else differs for a client, with both values: names, units, what only one says, the control rate."""
     found: list[str] = []
     for root, space, before in (
         ("obs", contract.observation_space, known.observation_space),
@@ -92,7 +92,9 @@ def _elements(leaf: LeafSpec, known: LeafSpec) -> Iterator[tuple[str, str]]:
 def _label(elements: tuple[Element, ...]) -> str:
     if not elements:
         return "without a name"
-    return f"'{elements[0].name}' [{elements[0].unit or 'no unit'}]"
+    element = elements[0]
+    said = [element.quantity or "", element.joint and f"of {element.joint}", element.frame and f"in {element.frame}"]
+    return ", ".join([f"'{element.name}' [{element.unit or 'no unit'}]", *filter(None, said)])
 
 
 def _rate(contract: Contract) -> str:

@@ -21,7 +21,7 @@ from onnx import TensorProto, helper
 from bundles import PARITY, PROVENANCE, save_graph
 from rlservo.bundle import bundle as bundle_files
 from rlservo.bundle.contract import Contract, TensorSpec
-from rlservo.bundle.spaces import BoxSpec, DictSpec, Element
+from rlservo.bundle.spaces import BoxSpec, DictSpec, Element, Quantity
 from rlservo.client.admin_client import AdminClient
 from rlservo.client.policy_client import PolicyClient
 from rlservo.client.stream_client import StreamClient
@@ -49,6 +49,7 @@ def arm(
     actions: int = 3,
     dtype: str = "float32",
     camera: bool = False,
+    command: Quantity | None = None,
 ) -> Path:
     """A policy that gives its version number in each element: observations are three joints and a goal."""
     folder = root / "arm" / version
@@ -82,7 +83,11 @@ def arm(
         version=version,
         observation_space=DictSpec(spaces=spaces),
         action_space=BoxSpec(
-            shape=(actions,), dtype="float32", low=-high, high=high, elements=elements if actions == 3 else ()
+            shape=(actions,),
+            dtype="float32",
+            low=-high,
+            high=high,
+            elements=tuple(each.model_copy(update={"quantity": command}) for each in elements) if actions == 3 else (),
         ),
         inputs=tuple(TensorSpec(name=f"obs.{name}", dtype=kind, shape=(-1, n)) for name, (kind, n) in leaves.items()),
         outputs=(TensorSpec(name="action", dtype="float32", shape=(-1, actions)),),
@@ -106,6 +111,10 @@ HARMLESS: dict[str, tuple[dict[str, Any], str]] = {
     "4": ({"unit": ""}, "obs.joints element 0 is 'shoulder' [no unit] instead of 'shoulder' [rad]"),
     "5": ({"rate_hz": 20.0}, "the control rate is 20 Hz instead of 10 Hz"),
     "6": ({}, ""),
+    "7": (
+        {"command": "joint position"},
+        "action element 0 is 'shoulder' [rad], joint position instead of 'shoulder' [rad]",
+    ),
 }
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "11": ({"names": ("elbow", "shoulder", "wrist")}, "obs.joints has 'elbow' as element 0 instead of 1"),
