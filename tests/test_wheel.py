@@ -38,7 +38,8 @@ def test_metadata_installs_no_developers_tools_and_has_no_placeholder(wheel: Pat
     head, _, readme = text.partition("\n\n")
     everything = [line for line in head.splitlines() if line.endswith('extra == "all"')]
     assert everything == [
-        'Requires-Dist: rlservo[client,cockpit,hub,ray,record,remote,rosbridge,serve,sim,train,ur]; extra == "all"',
+        "Requires-Dist: rlservo[client,cockpit,hub,ray,record,remote,rosbridge,serve,sign,sim,tracing,train,ur]; "
+        'extra == "all"',
         'Requires-Dist: minari>=0.5; python_version >= "3.11" and extra == "all"',
     ]
     assert "<this repository>" not in readme

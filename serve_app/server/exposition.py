@@ -98,8 +98,9 @@ def sessions(handler: RequestHandler) -> None:
     """Sample the episodes in memory."""
     episodes, kept, show = handler.episodes, handler.episodes.sessions, handler.metrics
     now, store = kept.count(), handler.control.store
-    served = () if store is None else store.names  # from 0 on: a series that begins at 1 shows Prometheus no increase
-    for name in sorted({*served, *now, *episodes.begun, *episodes.lost}):
+    # From 0 on: a series that begins at 1 shows Prometheus no increase.
+    remembering = () if store is None else [each.contract.name for each in store.policies if each.is_stateful]
+    for name in sorted({*remembering, *now, *episodes.begun, *episodes.lost}):
         show.gauge("rlservo_sessions", "Sessions in this process", now[name], policy=name)
         show.counter("rlservo_sessions_begun", "Sessions begun", episodes.begun[name], policy=name)
         show.counter("rlservo_sessions_evicted", "Sessions forgotten when idle", kept.evicted[name], policy=name)

@@ -369,11 +369,11 @@ def test_files_of_two_runs_are_refused_with_both_names(tmp_path: Path) -> None:
     train(tmp_path / "run", settings(), environment({}))
     action = {"joint_names": ROBOT, "scale": 0.5, "offset": DEFAULTS.tolist(), "clip": None}
     describe(tmp_path / "run", ROBOT, [{**action, "offset": [1.7, 0.0, -1.712]}])
-    refuse(tmp_path / "run", r"has the offset \[1.712.*env.yaml, and \[1.7, .*IO_descriptors.yaml")
+    refuse(tmp_path / "run", r"has the offset \[1.712.*env.yaml, but \[1.7, .*IO_descriptors.yaml")
     describe(tmp_path / "run", ROBOT, [{**action, "joint_names": list(JOINTS)}])
-    refuse(tmp_path / "run", "has the joint_names .*env.yaml, and .*IO_descriptors.yaml")
+    refuse(tmp_path / "run", "has the joint_names .*env.yaml, but .*IO_descriptors.yaml")
     describe(tmp_path / "run", ROBOT, [{**action, "scale": [0.5, 0.5, 0.25]}])
-    refuse(tmp_path / "run", "has the scale .*env.yaml, and .*IO_descriptors.yaml")
+    refuse(tmp_path / "run", "has the scale .*env.yaml, but .*IO_descriptors.yaml")
     describe(tmp_path / "run", ROBOT, [action])
     refuse(
         tmp_path / "run", "joint order that was given .* is not that of .*IO_descriptors.yaml", joint_order=list(JOINTS)
