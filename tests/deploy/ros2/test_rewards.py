@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rlservo.deploy.ros2 import node as ros2_node
+from rlservo.deploy.ros2.targets import GivenTarget
 
 
 class Seeing:
@@ -35,6 +36,9 @@ class Track:
         self.unwrapped = SimpleNamespace(
             reset_options=lambda start: {"start": start},
             robot=SimpleNamespace(hold=lambda: None, is_called_off=lambda: False, stopped_by=None),
+            simulation=SimpleNamespace(pose=np.zeros(3)),
+            target_position=lambda: np.array([1.0, 2.0, 0.0]),
+            robot_position=lambda: np.zeros(3),
         )
         self.steps = 0
 
@@ -51,11 +55,17 @@ class Track:
 def test_policy_gets_the_reward_of_its_last_action() -> None:
     policy, entered = Seeing(), []
     node: Any = SimpleNamespace(
-        policy=policy, stop=threading.Event(), wanted=ros2_node.Wanted.RUN, counts=Counter(),
-        enter=lambda state, why="": entered.append(state),
-    )  # fmt: skip
-    target: Any = SimpleNamespace(number=1, begun=0, done=0, pose=SimpleNamespace(x=1.0, y=2.0, z=0.0))
-    ros2_node._drive_to(node, Track(), "target_pose", target)
+        policy=policy, stop=threading.Event(), wanted=ros2_node.Wanted.RUN, counts=Counter(), state="", why=""
+    )
+
+    def enter(state: str, why: str = "") -> None:
+        entered.append(state)
+        node.state, node.why = state, why
+
+    node.enter = enter
+    target, ended = GivenTarget(1, (1.0, 2.0, 0.0)), []
+    targets: Any = SimpleNamespace(newest=target, begun=0, tell=lambda *_: None, end=lambda *how: ended.append(how))
+    ros2_node._drive_to(node, Track(), "target_pose", targets, target)
     assert policy.rewards == [0.0, 0.5, 1.0]
     assert entered == ["starting", "running", "running", "arrived"]
-    assert node.counts["decisions"] == 3 and target.done == 1
+    assert node.counts["decisions"] == 3 and ended[0][:2] == (target, "succeed")
