@@ -28,7 +28,7 @@ FIELDS = {  # of the guide's table of outputs, with their sizes on the wire
     "timestamp": "d", "target_q": "6d", "target_qd": "6d", "actual_q": "6d", "actual_qd": "6d",
     "runtime_state": "I", "speed_scaling": "d", "target_speed_fraction": "d",
 }  # fmt: skip
-_addresses = itertools.count(os.getpid())
+_addresses = itertools.count()
 
 Vector = NDArray[np.float64]
 
@@ -181,8 +181,9 @@ class OutsideArm:
 @contextmanager
 def outside_arm(model: str = "ur5", rate_hz: float = 125.0) -> Iterator[OutsideArm]:
     """Run a controller and record it."""
-    number = next(_addresses)
-    host = f"127.{1 + number // 62500 % 250}.{number // 250 % 250}.{1 + number % 250}"
+    # Another address than those of tests in other processes, whose ids follow each other.
+    process_id = os.getpid()
+    host = f"127.{1 + process_id // 250 % 250}.{process_id % 250}.{1 + next(_addresses) % 250}"
     process = subprocess.Popen(
         [sys.executable, "-m", "rlservo.deploy.cli", "ur-controller", "--model", model, "--host", host],
         stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True,
