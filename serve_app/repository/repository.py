@@ -21,6 +21,7 @@ from rlservo.bundle.bundle import (
     MAX_FILES,
     MAX_SUMS_BYTES,
     SUMS_FILE,
+    Bundle,
     BundleLimits,
     digest_of,
     find_bundles,
@@ -205,22 +206,34 @@ class Repository:
             raise exchanged(name, version, folder)
         try:
             signer = check_signature(bundle, self._keys)
-        except BundleError:  # it may have been signed, or signed with another key, since
-            if not (is_cached and self._fetch_signature(folder, f"{name}/{version}")):
+        except BundleError as error:  # it may have been signed, or signed with another key, since
+            if not is_cached:
                 raise
-            signer = check_signature(bundle, self._keys)
+            signer = self._published_signer(bundle, self._keys, error)
         logger.info("policy '%s' version %s: signed by %s", name, version, signer)
 
-    def _fetch_signature(self, folder: Path, remote: str) -> bool:
-        """Replace the signature of a bundle in the cache by the published one; return whether there is one."""
+    def _published_signer(self, bundle: Bundle, keys: Path, fault: BundleError) -> str:
+        """Return the signer of a bundle in the cache by the first published signature that holds, and keep that one.
+
+        Raises UnavailableError if a storage that may have one could not be read, else `fault`.
+        """
+        unread: UnavailableError | None = None
         for storage in self._storages:
-            with tempfile.TemporaryDirectory(dir=folder) as beside:
+            with (
+                tempfile.TemporaryDirectory(dir=bundle.path) as beside,
+                contextlib.suppress(FileNotFoundError, BundleError),
+            ):
                 file = Path(beside, SIGNATURE_FILE)
-                with contextlib.suppress(FileNotFoundError), file.open("wb") as stream:
-                    storage.copy(f"{remote}/{SIGNATURE_FILE}", MAX_SIGNATURE_BYTES, stream)
-                    file.replace(folder / SIGNATURE_FILE)
-                    return True
-        return False
+                try:
+                    with file.open("wb") as stream:
+                        name = f"{bundle.contract.name}/{bundle.contract.version}/{SIGNATURE_FILE}"
+                        storage.copy(name, MAX_SIGNATURE_BYTES, stream)
+                except UnavailableError as error:
+                    unread = unread or error
+                    continue
+                file.replace(bundle.path / SIGNATURE_FILE)
+                return check_signature(bundle, keys)
+        raise unread or fault
 
     def _download(self, name: str, version: str, digest: str, entry: Path) -> None:
         """Fetch a bundle from the first storage that has it.

@@ -400,6 +400,23 @@ def test_an_interrupted_publication_is_completed_with_the_signature_made_since(
             publish(bundle, place)
 
 
+def test_a_good_signature_of_another_place_counts(tmp_path: Path, bundle: Bundle, storage: Storage) -> None:
+    """Two places have the bundle; the first has no signature, then one by a key that nobody trusts."""
+    (_, trusted), (_, other) = write(tmp_path, "trusted"), write(tmp_path, "other")
+    (tmp_path / "keys" / "other.pem").unlink()
+    first, second = f"{storage.uri}/first", f"{storage.uri}/second"
+    publish(bundle, first)
+    sign(bundle, trusted)
+    publish(bundle, second)
+    for is_signed in (False, True):
+        if is_signed:
+            sign(bundle, other)
+            publish(bundle, first)
+        fetched = Repository([first, second], cache=tmp_path / f"cache{is_signed}", keys=tmp_path / "keys")
+        with fetched.fetch("ur5", "1", bundle.digest) as folder:
+            assert check_signature(load_bundle(folder), tmp_path / "keys") == "trusted.pem"
+
+
 def test_the_commands_sign_and_require(tmp_path: Path, bundle: Bundle) -> None:
     (_, private), keys = write(tmp_path, "team"), tmp_path / "keys"
     served = ("serve", tmp_path / "policies", "--port", 0, "--require-signature", keys)
