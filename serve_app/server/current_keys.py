@@ -1,4 +1,4 @@
-"""API keys in use: each process rereads their file while the server runs, and limits their rate by itself.
+"""API keys in use: each process rereads their file while the server runs.
 
 The file's whole content is compared, so it does not matter how it was changed: written in place, renamed over, or
 behind the symbolic links that Kubernetes swaps. Content with which a server would not start changes nothing, and is
@@ -8,13 +8,11 @@ logged once.
 from __future__ import annotations
 
 import logging
-import time
-from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
-from rlservo.errors import RateLimitError, UnavailableError, UsageError
-from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, read_key_file
+from rlservo.errors import UnavailableError, UsageError
+from rlservo.serve_app.server.api_keys import Keys, read_key_file
+from rlservo.serve_app.server.rate_limits import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 
@@ -22,32 +20,6 @@ logger = logging.getLogger(__name__)
 
 PERIOD_S = 0.5  # [s] between reads; content is used once two in a row agree, as one may catch a half-written file
 READ_S = 5.0  # [s] for one read; after two without an answer from the file system the keys count as outdated
-ROUNDING_S = 1e-6
-
-
-class RateLimits:
-    """Remaining requests of each key with a limit. Keys without a limit are not tracked."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._rested_at: dict[str, float] = {}  # by label: when a whole burst may come again
-        self.refused: Counter[str] = Counter()
-        """Requests refused, by label."""
-
-    def spend(self, key: Key, limit: RateLimit) -> None:
-        """Count a request of a key. Raises RateLimitError beyond its limit."""
-        now = self._clock()
-        rested_at = max(now, self._rested_at.get(key.label, now))
-        wait_s = rested_at - now - (limit.burst - 1) / limit.rate
-        if wait_s > ROUNDING_S:
-            self.refused[key.label] += 1
-            raise RateLimitError(
-                f"the key '{key.label}' allows {limit.rate:g} requests a second in this process, {limit.burst} at "
-                f"once: wait {wait_s:.3g} s",
-                {"retry_after_s": round(wait_s, 3)},
-                key=key.label,
-            )
-        self._rested_at[key.label] = rested_at + 1.0 / limit.rate
 
 
 class CurrentKeys:

@@ -25,7 +25,7 @@ from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
 from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, Role, new_key
-from rlservo.serve_app.server.current_keys import RateLimits
+from rlservo.serve_app.server.rate_limits import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from servers import exchange
