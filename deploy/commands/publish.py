@@ -41,6 +41,7 @@ def publish(
     from rlservo.policy.policy import Policy
     from rlservo.serve_app.repository.publication import next_version
     from rlservo.serve_app.repository.publication import publish as publish_bundle
+    from rlservo.serve_app.repository.signature import SIGNATURE_FILE
 
     chosen = load_bundle(bundle_of(bundle, None))
     with tempfile.TemporaryDirectory(prefix="rlservo-publish-") as folder:
@@ -50,6 +51,10 @@ def publish(
             with needs_extra("train", "torch", "onnx"):
                 from rlservo.export.renumber_bundle import renumber
 
+                if (chosen.path / SIGNATURE_FILE).exists():
+                    terminal.note(
+                        f"{SIGNATURE_FILE} is of version {chosen.contract.version}: {version} has no signature"
+                    )
                 chosen = renumber(chosen, str(version), Path(folder))
         Policy.load(chosen.path).close()  # do not publish a bundle that no server would load
         text = ""

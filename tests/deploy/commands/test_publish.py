@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -32,3 +33,11 @@ def test_a_bundle_is_published_under_its_own_and_the_next_free_number(ur5: Path,
 def test_what_is_no_version_is_refused(version: str, ur5: Path, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["publish", str(ur5), str(tmp_path / "p"), "--version", version])
     assert "cannot be a version" in str(done.exception)
+
+
+def test_a_signature_is_not_published_under_another_number_and_that_is_said(ur5: Path, tmp_path: Path) -> None:
+    bundle = shutil.copytree(ur5, tmp_path / "ur5" / "10")
+    (bundle / "model.sig").write_text("of version 10")
+    done = CliRunner().invoke(app, ["publish", str(bundle), str(tmp_path / "p"), "--version", "11"])
+    assert done.exit_code == 0 and "model.sig is of version 10: 11 has no signature" in " ".join(done.output.split())
+    assert not (tmp_path / "p" / "ur5" / "11" / "model.sig").exists()

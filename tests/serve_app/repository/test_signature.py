@@ -308,7 +308,7 @@ def test_keys_are_changed_while_serving(tmp_path: Path) -> None:
 def test_a_signed_bundle_that_is_there_only_for_the_check_helps_no_other(
     tmp_path: Path, bundle: Bundle, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever writes into the folder exchanges it twice: before the signature is checked, and after that."""
+    """Someone who can write into the folder exchanges the bundle before the signature check and again after it."""
     sign(bundle, write(tmp_path, "team")[1])
     signed, evil = bundle.path.rename(tmp_path / "signed"), write_box_policy(tmp_path / "evil", seed=5)
     bundle.path.symlink_to(evil)
