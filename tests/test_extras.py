@@ -41,6 +41,7 @@ NEEDS: dict[str, tuple[str, ...]] = {
     "publish {bundle} s3://127.0.0.1/bucket": ("remote",),
     "publish {bundle} hf://owner/name": ("hub",),
     "sign {bundle} --key {bundle}/contract.json": ("sign",),
+    "RLSERVO_TRACING=1 RLSERVO_PLAN=plan serve {bundle} --port 0": ("serve", "tracing"),
     "cockpit --robot-server 127.0.0.1:1": ("cockpit",),
     "rollout rlservo/EndEffectorPositioningURRob-v0 --bundle {bundle} --env-arg robot=rtde://127.0.0.1": ("ur", "sim"),
     "rollout rlservo/NoObstacleNavigationMir100Rob-v0 --bundle {bundle} --env-arg robot=rosbridge://127.0.0.1": (
@@ -81,6 +82,8 @@ for words in json.load(sys.stdin):
         if child == 0:
             os.dup2(out.fileno(), 1)
             os.dup2(out.fileno(), 2)
+            while "=" in words[0]:
+                name, _, os.environ[name] = words.pop(0).partition("=")
             sys.argv = ["rlservo", *words]
             code = 70
             try:
