@@ -58,6 +58,7 @@ GOALS = {
     "robots64.p50": ("64 robots at 20 Hz, p50", 1.0),
     "robots64.p99": ("64 robots at 20 Hz, p99", 1.0),
     "robots64.p999": ("64 robots at 20 Hz, p99.9", 1.0),
+    "crowd64.p99": ("64 connections, p99", 1.5),
     "stream.p50": ("WebSocket, p50", 1.2),
 }
 FIRST_ANSWER_S, MEMORY_MB, ADDED_ON_RAY_MS = 1.0, 120.0, 0.15
@@ -75,6 +76,7 @@ def measured(name: str, peer: Peer, case: Case, port: int, scale: float) -> Row:
             "sixteen": replace(one, connections=16),
             "robots16": replace(one, connections=16, rate_hz=50, seconds=3 * scale),
             "robots64": replace(one, connections=64, rate_hz=20, seconds=3 * scale),
+            "crowd64": replace(one, connections=64),
         }
         if peer.stream:
             message = base64.b64encode(peer.message).decode()

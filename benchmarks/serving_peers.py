@@ -27,7 +27,7 @@ PEERS = Path(__file__).resolve().parent / "peers"
 OURS, BARE, OURS_ON_RAY, BARE_ON_RAY = "rlservo serve", "bare uvicorn ASGI", "rlservo on Ray Serve", "bare on Ray Serve"
 COMPLETE = ".complete"  # written last
 INSTALL_S = 600
-SWITCHES = {"RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1"}
+SWITCHES = {"RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1", "RAY_worker_niceness": "0"}
 
 
 @dataclass(frozen=True)
