@@ -54,6 +54,7 @@ check: setup  ## Lint, format and types, as CI runs them
 docs: setup  ## The site into site/; a broken link or an undocumented public name fails
 	$(BIN)/python .ci/reference.py --check
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	$(BIN)/python .ci/demo_pages.py site/demo  # pages of policies, from npm's libraries; left out without a network
 
 bench: setup  ## Simulator, training, and export speed, printed and written to bench/
 	$(BIN)/python benchmarks/simulators.py

@@ -27,7 +27,7 @@ from rlservo.deploy.cli import app
 from rlservo.policy.options import PolicyOptions
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.error_statuses import status_of
-from rlservo.serve_app.server import exposition, metrics
+from rlservo.serve_app.server import metrics, sampled_metrics
 from rlservo.serve_app.server.settings import PREFIX, ServerSettings
 from rlservo.serve_app.versions.plan_commands import COMMANDS
 
@@ -230,7 +230,7 @@ def metric_list() -> str:
             "replica. Drift (`observation_...`) is measured from one request in 16, for policies with `MeanStdFilter`."
         )
     )
-    found = sorted([*metric_calls(metrics), *metric_calls(exposition)])
+    found = sorted([*metric_calls(metrics), *metric_calls(sampled_metrics)])
     text.append("\n".join(bullet(name, ", ".join([kind, *labels]), text) for name, kind, text, labels in found))
     return "\n\n".join(text) + "\n"
 

@@ -23,6 +23,7 @@ from rlservo.deploy.commands.inspect import inspect
 from rlservo.deploy.commands.key import key
 from rlservo.deploy.commands.learn import learn
 from rlservo.deploy.commands.log import log
+from rlservo.deploy.commands.page import page
 from rlservo.deploy.commands.policy import policy
 from rlservo.deploy.commands.promote import promote
 from rlservo.deploy.commands.publish import publish
@@ -80,6 +81,7 @@ for command in (
     inspect,
     verify,
     compile,
+    page,
     sign,
     publish,
     learn,

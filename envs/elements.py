@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.robots.checks import ElementInfo
+from rlservo.robots.argument_checks import ElementInfo
 
 
 def joint_elements(

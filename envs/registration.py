@@ -12,6 +12,8 @@ ENTRY_POINTS = {
     "EmptyEnvironmentURSim-v0": "rlservo.envs.ur.empty_environment:EmptyEnvironmentURSim",
     "BasicAvoidanceURSim-v0": "rlservo.envs.ur.basic_avoidance:BasicAvoidanceURSim",
     "IsaacReachURSim-v0": "rlservo.envs.ur.isaac_reach:IsaacReachURSim",
+    "IsaacDeployReachURSim-v0": "rlservo.envs.ur.isaac_deploy_reach:IsaacDeployReachURSim",
+    "IsaacDeployReachURRob-v0": "rlservo.envs.ur.isaac_deploy_reach:IsaacDeployReachURRob",
     "EmptyEnvironmentPandaSim-v0": "rlservo.envs.panda.arm_env:EmptyEnvironmentPandaSim",
     "EndEffectorPositioningPandaSim-v0": "rlservo.envs.panda.end_effector_positioning:EndEffectorPositioningPandaSim",
     "NoObstacleNavigationMir100Sim-v0": "rlservo.envs.mir100.no_obstacle_navigation:NoObstacleNavigationMir100Sim",

@@ -25,7 +25,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import shared.ray_settings as ray_settings  # before Ray  # isort: skip
 import evaluate_shipped
@@ -46,7 +46,7 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from ray.rllib.utils.schedules.scheduler import Scheduler
 from ray.tune.registry import ENV_CREATOR, _global_registry, get_trainable_cls, register_env
 from shared.imitation import Imitation, fit_to_solution
-from shared.training_run import build, iterate, main_with_sentences, ray_session
+from shared.training_run import build, iterate, main_with_sentences, ray_session, sigterm_as_ctrl_c
 
 from rlservo import Policy, errors, export_checkpoint
 from rlservo.drive.success import success_of
@@ -297,7 +297,7 @@ class Validation:
         self._next = row.env_steps + self.env_steps
         return True
 
-    def success(self, algorithm: Algorithm, settings: dict[str, Any]) -> float:
+    def success(self, algorithm: Training, settings: dict[str, Any]) -> float:
         """Return the share of successes, over all that the settings evaluate."""
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = Path(folder) / "checkpoint"
@@ -447,25 +447,25 @@ def _imitate(algorithm: Algorithm, settings: dict[str, Any]) -> None:
     runners.sync_weights(from_worker_or_learner_group=learners, inference_only=True)
 
 
-def train(
-    config: AlgorithmConfig, settings: dict[str, Any], folder: Path, beginning: Beginning | None = None
-) -> list[Row]:
+class Training(Protocol):
+    """What trains: RLlib's Algorithm, or an `RslRlRun`."""
+
+    def save_to_path(self, path: str) -> Any: ...
+    def stop(self) -> None: ...
+
+
+def train(algorithm: Training, lines: Iterator[Row], settings: dict[str, Any], folder: Path) -> list[Row]:
     """Train until the stop metric or the steps are reached; leave `folder/checkpoint` (the best) and `curve.csv`."""
     stop = settings["stop"]
     validation = Validation(**settings["validation"]) if "validation" in settings else None
     rows: list[Row] = []
     best, reached_milestone = float("-inf"), False
     checkpoint = folder / "checkpoint"
-    algorithm = build(config)
-    if beginning is not None:
-        beginning.apply(algorithm, settings)
-    if "imitate" in settings:
-        _imitate(algorithm, settings)
     try:
         with (folder / "curve.csv").open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(CURVE)
-            for row in iterations(algorithm, stop["episodes"]):
+            for row in lines:
                 rows.append(row)
                 writer.writerow(
                     [row.env_steps, row.episodes, f"{row.mean_return:.4g}", f"{row.mean_length:.1f}",
@@ -509,6 +509,19 @@ def train(
     return rows
 
 
+def train_rllib(settings: dict[str, Any], folder: Path, beginning: Beginning | None) -> list[Row]:
+    # Checkpoints hold functions of this file. Pickled by value, they load without it.
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    config = algorithm_config(settings, settings["seed"])  # wrong settings are reported before Ray starts
+    with ray_session(num_cpus=1):
+        algorithm = build(config)
+        if beginning is not None:
+            beginning.apply(algorithm, settings)
+        if "imitate" in settings:
+            _imitate(algorithm, settings)
+        return train(algorithm, iterations(algorithm, settings["stop"]["episodes"]), settings, folder)
+
+
 def draw(rows: list[Row], title: str, path: Path) -> None:
     """Draw return, and success if the environment reports it, over environment steps."""
     import matplotlib
@@ -537,7 +550,12 @@ def install(name: str, folder: Path) -> None:
 
     small = folder / "pruned"
     shutil.rmtree(small, ignore_errors=True)
-    prune_checkpoint(folder / "checkpoint", small, notify=print)
+    if (folder / "checkpoint" / "params").is_dir():  # rsl_rl's, of which only the actor was saved
+        shutil.copytree(folder / "checkpoint", small)
+        for old in (SHIPPED / name).glob("model_*.pt"):
+            old.unlink()
+    else:
+        prune_checkpoint(folder / "checkpoint", small, notify=print)
     shutil.copytree(small, SHIPPED / name, dirs_exist_ok=True)
     for curve in ("curve.csv", "curve.png"):
         shutil.copyfile(folder / curve, SHIPPED / name / curve)
@@ -567,12 +585,15 @@ def main() -> None:
     folder = args.storage / args.name
     folder.mkdir(parents=True, exist_ok=True)
 
-    # Checkpoints hold functions of this file. Pickled by value, they load without it.
-    cloudpickle.register_pickle_by_value(sys.modules[__name__])
     torch.set_num_threads(1)
-    config = algorithm_config(settings, seed)  # wrong settings are reported before Ray starts
-    with ray_session(num_cpus=1):
-        rows = train(config, settings, folder, beginning)
+    if settings.get("trainer") == "rsl_rl":
+        from shared.rsl_rl_training import RslRlRun
+
+        run = RslRlRun(settings, SHIPPED / args.name)
+        with sigterm_as_ctrl_c():
+            rows = train(run, (Row(*line) for line in run.iterations(settings["stop"]["episodes"])), settings, folder)
+    else:
+        rows = train_rllib(settings, folder, beginning)
     draw(rows, f"{args.name}, {settings['algorithm']}, seed {seed}", folder / "curve.png")
     print(f"best checkpoint: {folder / 'checkpoint'}")
     if args.install:

@@ -82,7 +82,9 @@ def _space(title: str, root: str, space: Any) -> Iterator[str]:
         shape = "x".join(map(str, leaf.shape))
         low, high = (bound.ravel() for bound in leaf.bounds())
         if not leaf.elements or leaf.size > MOST:
-            yield f"{shape} numbers ({leaf.dtype}), {_span(low.min(), high.max())}; they are not named one by one."
+            spans = [*dict.fromkeys(map(_span, low.tolist(), high.tolist()))]
+            span = spans[0] if len(spans) == 1 else "their ranges " + ", ".join(spans[:4] + ["..."] * (len(spans) > 4))
+            yield f"{shape} numbers ({leaf.dtype}), {span}; they are not named one by one."
             continue
         yield _table(("#", "name", "unit", "what", "range"), _rows(leaf, low.tolist(), high.tolist()))
 

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
@@ -52,14 +53,13 @@ class RunningArm:
         return next((one for one in reversed(samples) if abs(one.velocities).max() > 0.01), samples[0])
 
 
-def run_arm(model: str = "ur5e") -> Iterator[RunningArm]:
-    """Serve a controller until the generator is closed."""
+def run_arm(model: str = "ur5e", **options: Any) -> Iterator[RunningArm]:
+    """Serve a controller until the generator is closed; the options are the controller's."""
     while True:
         number = next(_counter)
         try:
-            server = ControllerServer(
-                Controller(model), host=f"127.{1 + number // 62500 % 250}.{number // 250 % 250}.{1 + number % 250}"
-            )
+            host = f"127.{1 + number // 62500 % 250}.{number // 250 % 250}.{1 + number % 250}"
+            server = ControllerServer(Controller(model, **options), host=host)
             break
         except CannotListenError:
             continue

@@ -10,7 +10,6 @@ import contextlib
 import functools
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +33,7 @@ from rlservo.bundle.contract import (
     StateSpec,
     TensorSpec,
 )
-from rlservo.bundle.spaces import BoxSpec, DiscreteSpec, Element
+from rlservo.bundle.spaces import BoxSpec, DiscreteSpec, Element, leaf_specs
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
@@ -67,6 +66,19 @@ PARITY = Parity(
     atol=1e-6,
     formats={"onnx": FormatParity(max_abs=0, max_rel=0)},
 )
+
+
+def contract_of(name: str, obs: Any, action: Any, *, version: str = "1", **more: Any) -> Contract:
+    """Return the contract of a policy of these spaces; `more` are fields that differ from those of a plain one."""
+    inputs, outputs = (
+        tuple(TensorSpec(name=path, dtype=leaf.dtype, shape=(-1, *leaf.shape)) for path, leaf in leaves.items())
+        for leaves in (leaf_specs(obs, "obs"), leaf_specs(action, "action"))
+    )
+    plain: dict[str, Any] = {
+        "inputs": inputs, "outputs": outputs, "distribution": None, "baked_in": (BakedStep(step="network"),),
+        "control_rate_hz": None, "provenance": PROVENANCE, "parity": PARITY,
+    }  # fmt: skip
+    return Contract(name=name, version=version, observation_space=obs, action_space=action, **{**plain, **more})
 
 
 def weights(rng: np.random.Generator, rows: int, columns: int) -> NDArray[np.float32]:
@@ -166,29 +178,24 @@ def write_box_policy(
         [("action", TensorProto.FLOAT, ["batch", ACTIONS]), ("action_dist_inputs", TensorProto.FLOAT, ["batch", 12])],
     )
     bounds = tuple(high.tolist())
-    contract = Contract(
-        name=name,
-        version=version,
-        observation_space=BoxSpec(
-            shape=(OBS,), dtype="float32", low=None, high=None, elements=UR5_ELEMENTS if named else ()
-        ),
-        action_space=BoxSpec(
+    contract = contract_of(
+        name,
+        BoxSpec(shape=(OBS,), dtype="float32", low=None, high=None, elements=UR5_ELEMENTS if named else ()),
+        BoxSpec(
             shape=(ACTIONS,),
             dtype="float32",
             low=None if unbounded else tuple(-b for b in bounds),
             high=None if unbounded else bounds,
             elements=tuple(Element(name=f"joint_{i}", unit="rad", quantity="joint position") for i in range(ACTIONS)),
         ),
-        inputs=(TensorSpec(name="obs", dtype="float32", shape=(-1, OBS)),),
-        outputs=(
-            TensorSpec(name="action", dtype="float32", shape=(-1, ACTIONS)),
-            TensorSpec(name="action_dist_inputs", dtype="float32", shape=(-1, 12)),
+        version=version,
+        outputs=tuple(
+            TensorSpec(name=output, dtype="float32", shape=(-1, size))
+            for output, size in (("action", ACTIONS), ("action_dist_inputs", 2 * ACTIONS))
         ),
         distribution=Distribution(kind="diag_gaussian", transform="none" if unbounded else "unsquash"),
         baked_in=(BakedStep(step="network"), BakedStep(step="clip")),
         control_rate_hz=10.0,
-        provenance=PROVENANCE,
-        parity=PARITY,
     )
     # Small golden observations keep the actions of an unclipped policy inside its space.
     obs = (rng.standard_normal((8, OBS)) * (0.05 if action_scale > 1 else 1.0)).astype(np.float32)
@@ -242,21 +249,17 @@ def write_discrete_policy(root: Path, *, name: str = "gridworld", version: str =
         [("obs", TensorProto.INT64, ["batch"])],
         [("action", TensorProto.INT64, ["batch"]), ("action_dist_inputs", TensorProto.FLOAT, ["batch", 3])],
     )
-    contract = Contract(
-        name=name,
+    contract = contract_of(
+        name,
+        DiscreteSpec(n=5),
+        DiscreteSpec(n=3, start=start),
         version=version,
-        observation_space=DiscreteSpec(n=5),
-        action_space=DiscreteSpec(n=3, start=start),
-        inputs=(TensorSpec(name="obs", dtype="int64", shape=(-1,)),),
         outputs=(
             TensorSpec(name="action", dtype="int64", shape=(-1,)),
             TensorSpec(name="action_dist_inputs", dtype="float32", shape=(-1, 3)),
         ),
         distribution=Distribution(kind="categorical", transform="none"),
         baked_in=(BakedStep(step="one_hot"), BakedStep(step="network")),
-        control_rate_hz=None,
-        provenance=PROVENANCE,
-        parity=PARITY,
     )
     return write_bundle(folder, contract, np.arange(5, dtype=np.int64))
 
@@ -288,34 +291,24 @@ def write_leaky_policy(
         [("obs", TensorProto.FLOAT, ["batch", sees]), ("state_in.h", TensorProto.FLOAT, ["batch", does])],
         [("action", TensorProto.FLOAT, ["batch", does]), ("state_out.h", TensorProto.FLOAT, ["batch", does])],
     )
-    contract = Contract(
-        name=name,
+    inputs, outputs = (
+        tuple(TensorSpec(name=each, dtype="float32", shape=(-1, size)) for each, size in tensors.items())
+        for tensors in ({"obs": sees, "state_in.h": does}, {"action": does, "state_out.h": does})
+    )
+    contract = contract_of(
+        name,
+        observed,
+        acted,
         version=version,
-        observation_space=observed,
-        action_space=acted,
-        inputs=(
-            TensorSpec(name="obs", dtype="float32", shape=(-1, sees)),
-            TensorSpec(name="state_in.h", dtype="float32", shape=(-1, does)),
-        ),
-        outputs=(
-            TensorSpec(name="action", dtype="float32", shape=(-1, does)),
-            TensorSpec(name="state_out.h", dtype="float32", shape=(-1, does)),
-        ),
+        inputs=inputs,
+        outputs=outputs,
         state=(StateSpec(name="h", dtype="float32", shape=(does,)),),
-        distribution=None,
         baked_in=(BakedStep(step="network"), BakedStep(step="clip")),
         control_rate_hz=10.0,
         provenance=PROVENANCE if like is None else like.provenance,
-        parity=PARITY,
     )
     obs, state = (rng.standard_normal((8, size)).astype(np.float32) for size in (sees, does))
     return write_bundle(folder, contract, obs, state_in__h=state)
-
-
-@pytest.fixture(scope="session")
-def leaky_policy() -> Callable[..., Path]:
-    """`write_leaky_policy`."""
-    return write_leaky_policy
 
 
 @pytest.fixture(scope="session")
@@ -334,33 +327,9 @@ def ur5(policies: Path) -> Path:
     return policies / "ur5" / "10"
 
 
-@pytest.fixture
-def rewrite_contract() -> Callable[..., None]:
+def rewrite_contract(folder: Path, **changes: Any) -> None:
     """Change fields of a bundle's contract and record the hashes again: tampering that hashes cannot see."""
-
-    def rewrite(folder: Path, **changes: Any) -> None:
-        contract = bundle_files.read_contract(folder).model_copy(update=changes)
-        bundle_files.write_contract(folder, contract)
-
-    return rewrite
-
-
-@pytest.fixture(scope="session")
-def box_policy() -> Callable[..., Path]:
-    """`write_box_policy`: fixtures are how test modules reach this file."""
-    return write_box_policy
-
-
-@pytest.fixture(scope="session")
-def slow_policy() -> Callable[..., Path]:
-    """`write_slow_policy`."""
-    return write_slow_policy
-
-
-@pytest.fixture(scope="session")
-def discrete_policy() -> Callable[..., Path]:
-    """`write_discrete_policy`."""
-    return write_discrete_policy
+    bundle_files.write_contract(folder, bundle_files.read_contract(folder).model_copy(update=changes))
 
 
 EXPORTED_WITH = versions("ray", "torch", "onnx", "onnxscript", "onnxruntime", "gymnasium", "numpy")
@@ -451,16 +420,11 @@ def all_shipped() -> Path:
     return _exported("all-shipped-policies", {name: name for name in sorted(names)})
 
 
-@pytest.fixture(scope="session")
-def controlled() -> Callable[..., AbstractContextManager[PlanFollower]]:
+@contextlib.contextmanager
+def controlled(*folders: Path, config: Any = None, **loader: Any) -> Iterator[PlanFollower]:
     """Control over what is served of some folders, for an application that can be administered."""
-
-    @contextlib.contextmanager
-    def control_of(*folders: Path, config: Any = None, **loader: Any) -> Iterator[PlanFollower]:
-        loads = VersionLoader(Repository(list(folders)), **loader)
-        with tempfile.TemporaryDirectory() as plans:
-            control = PlanFollower(loads, plan_files(Path(plans)))
-            asyncio.run(control.configure({} if config is None else config))
-            yield control
-
-    return control_of
+    loads = VersionLoader(Repository(list(folders)), **loader)
+    with tempfile.TemporaryDirectory() as plans:
+        control = PlanFollower(loads, plan_files(Path(plans)))
+        asyncio.run(control.configure({} if config is None else config))
+        yield control

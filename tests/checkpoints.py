@@ -16,10 +16,13 @@ import pytest
 
 from cache import cached, versions
 
-ZOO = Path(__file__).resolve().with_name("zoo")
+HERE = Path(__file__).resolve().parent
+ZOO = HERE / "zoo"
 APP = ZOO / "app"  # the user's own code that some of the checkpoints need
 CONNECTORS = ZOO.parents[1] / "export/rllib/batched_connectors.py"  # our own, which one of them has
-TRAINED_WITH = [ZOO, CONNECTORS, versions("ray", "torch", "gymnasium", "numpy")]
+# A script as Python runs it, after the settings with which RLlib starts and makes connectors sooner.
+QUICKLY = "import quick_rllib, runpy, sys; del sys.argv[0]; runpy.run_path(sys.argv[0], run_name='__main__')"
+TRAINED_WITH = [ZOO, CONNECTORS, HERE / "quick_rllib.py", versions("ray", "torch", "gymnasium", "numpy")]
 
 
 def training_code() -> Path:
@@ -40,10 +43,12 @@ def trained(script: str) -> Path:
 
     def train(folder: Path) -> None:
         # With the token in its environment Ray writes none to the user's home.
-        environment = {**os.environ, "RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
+        token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(16)}
+        path = os.pathsep.join(part for part in (str(HERE), os.environ.get("PYTHONPATH", "")) if part)
+        environment = {**os.environ, **token, "PYTHONPATH": path}
         for prestart in ("enable_worker_prestart", "prestart_worker_first_driver"):
             environment[f"RAY_{prestart}"] = "0"  # everything here trains in one process
-        command = [sys.executable, "-W", "ignore", str(code / script), str(folder)]
+        command = [sys.executable, "-W", "ignore", "-c", QUICKLY, str(code / script), str(folder)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=580)
         assert done.returncode == 0, done.stderr[-3000:]
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import psutil
 import pytest
 import yaml
 
+from bundles import write_box_policy
 from rlservo.client.admin_client import AdminClient
 from rlservo.serve_app.server.api_keys import new_key
 from servers import free_ports
@@ -30,7 +31,12 @@ ROOT = Path(__file__).resolve().parents[1]
 KEY, LINE = new_key("operator", admin=True)
 PATIENCE_S = 120  # [s] on a busy machine
 RECURRENT = "lstm_box"
-SWITCHES = {"RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1", "RAY_AUTH_MODE": "token"}
+SWITCHES = {
+    "RAY_SERVE_ENABLE_HA_PROXY": "1",
+    "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
+    "RAY_AUTH_MODE": "token",
+    "RAY_worker_niceness": "0",
+}
 
 # A head node as `ray start --head` makes one, but gone when its standard input is.
 CLUSTER = """
@@ -124,15 +130,13 @@ class Cluster:
 
 
 @pytest.fixture(scope="session")
-def cluster_repository(
-    tmp_path_factory: pytest.TempPathFactory, box_policy: Callable[..., Path], recurrent: Path
-) -> Path:
+def cluster_repository(tmp_path_factory: pytest.TempPathFactory, recurrent: Path) -> Path:
     """ur5 in versions 1 to 3, 4 with a byte of its weights changed, and 5 whose actions leave the space; an LSTM."""
     root = tmp_path_factory.mktemp("repository")
     shutil.copytree(recurrent / RECURRENT, root / RECURRENT)
-    box_policy(root, version="5", seed=5, action_scale=400.0)
+    write_box_policy(root, version="5", seed=5, action_scale=400.0)
     for seed, version in enumerate(("1", "2", "3", "4")):
-        box_policy(root, version=version, seed=seed)
+        write_box_policy(root, version=version, seed=seed)
     weights = root / "ur5" / "4" / "policy.onnx"
     content = bytearray(weights.read_bytes())
     content[len(content) // 2] ^= 1

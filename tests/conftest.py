@@ -58,7 +58,6 @@ TOGETHER = {
     "tests/system/test_serving.py": "live server",
     "tests/system/test_serving_fuzz.py": "live server",
     "tests/system/test_serving_grpc.py": "live server",
-    "tests/system/test_serving_protocols.py": "live server",
     "tests/system/test_serving_sessions.py": "live server",
     "tests/system/test_robo_gym_client.py": "shipped server",
     "tests/system/test_served_policies.py": "shipped server",

@@ -22,7 +22,7 @@ from packaging.requirements import Requirement
 from cache import PYTHON, cached, versions
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGED = ("envs", "export", "serve_app", "deploy", "pyproject.toml", "README.md", "LICENSE")
+PACKAGED = ("rlservo", "envs", "export", "serve_app", "deploy", "pyproject.toml", "README.md", "LICENSE")
 ROBO_GYM = ("robo-gym==2.0.1", "robo-gym-server-modules==0.3.0.1")
 # What our light client imports. Not rlservo's own requirements: onnxruntime wants a newer protobuf than robo-gym, and
 # pip would settle that with an old robo-gym-server-modules that has no pin and does not work.

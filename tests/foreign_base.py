@@ -121,6 +121,7 @@ class ForeignBase:
         self.truth: list[Moment] = [Moment(time.monotonic(), 0.0, 0.0, 0.0, 0.0, 0.0)]
         self.commands: list[tuple[float, float, float]] = []  # time.monotonic(), [m/s], [rad/s]
         self.odom_error: Callable[[dict[str, Any]], None] = lambda _: None  # changes an Odometry before it is sent
+        self.scan_error: Callable[[dict[str, Any]], None] = lambda _: None  # a LaserScan
         self.silent: set[str] = set()  # topics that are not published
         self._types = TYPES | {one.topic: "sensor_msgs/LaserScan" for one in scanners}
         self._wanted, self._wanted_s = (0.0, 0.0), 0.0
@@ -149,6 +150,10 @@ class ForeignBase:
         """
         ahead = [low for low, _, right, left in self.boxes if low > 0.0 and right < half_width and left > -half_width]
         return min(ahead) - front - max(one.x for one in self.truth)
+
+    def move_scanner(self, scanner: Scanner) -> None:
+        """Publish another place of a scanner's frame, while it stays where it is."""
+        self._publish("/tf_static", {"transforms": [scanner.transform("base_link")]})
 
     def without_commands(self) -> float:
         """Return the longest time [s] between two commands while it drove."""
@@ -227,7 +232,7 @@ class ForeignBase:
         if scanner.blind is not None:
             ranges[scanner.blind(own)] = math.nan
         values = [None if self.has_null and not math.isfinite(value) else value for value in ranges.tolist()]
-        return {
+        message = {
             "header": self._header(scanner.frame),
             "angle_min": -scanner.half_angle,
             "angle_max": scanner.half_angle,
@@ -239,6 +244,8 @@ class ForeignBase:
             "ranges": values,
             "intensities": [],
         }
+        self.scan_error(message)
+        return message
 
     def _cast(self, x: float, y: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distance to the nearest box in each direction [m], by slabs."""

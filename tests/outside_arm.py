@@ -7,6 +7,7 @@ endian), the controller is the installed command.
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import socket
 import struct
@@ -29,6 +30,12 @@ FIELDS = {  # of the guide's table of outputs, with their sizes on the wire
     "runtime_state": "I", "speed_scaling": "d", "target_speed_fraction": "d",
 }  # fmt: skip
 _addresses = itertools.count()
+# Universal Robots, "DH Parameters for calculations of kinematics and dynamics", UR10e: a, d [m] and alpha [rad] of each
+# joint, in the controller's frame "base".
+DH_UR10E = (
+    (0.0, 0.1807, math.pi / 2), (-0.6127, 0.0, 0.0), (-0.57155, 0.0, 0.0),
+    (0.0, 0.17415, math.pi / 2), (0.0, 0.11985, -math.pi / 2), (0.0, 0.11655, 0.0),
+)  # fmt: skip
 
 Vector = NDArray[np.float64]
 
@@ -57,6 +64,15 @@ class Motion:
         change = np.abs(self.setpoint_velocities[rows:] - self.setpoint_velocities[:-rows])
         took = (self.time_s[rows:] - self.time_s[:-rows])[:, None]
         return float((change / took).max(initial=0.0))
+
+
+def flange(joints: Vector) -> Vector:
+    """Return a UR10e's flange in the controller's frame base (4, 4)."""
+    pose = np.eye(4)
+    for theta, (a, d, alpha) in zip(joints, DH_UR10E, strict=True):
+        (ct, st), (ca, sa) = (math.cos(theta), math.sin(theta)), (math.cos(alpha), math.sin(alpha))
+        pose = pose @ [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0, sa, ca, d], [0, 0, 0, 1]]
+    return pose
 
 
 class Recorder:

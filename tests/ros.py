@@ -275,3 +275,9 @@ def ros() -> Iterator[Ros]:
         yield graph
     finally:
         graph.close()
+
+
+@pytest.fixture(scope="module")
+def nodes() -> list[Process]:
+    """Nodes of a policy that a file's tests have started: all but the last have ended."""
+    return []

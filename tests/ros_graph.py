@@ -16,6 +16,7 @@ from typing import Any
 
 import rclpy
 from rclpy.action import ActionClient
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -63,9 +64,15 @@ def main() -> None:
         messages[topic].append((time.time(), message))
         del messages[topic][:-KEPT]
 
-    def subscribe(topic: str, kind: str) -> None:
+    def subscribe(topic: str, kind: str, is_kept: bool = False) -> None:
+        """Take messages; `is_kept`: only of publishers that keep them for late comers."""
         qos = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
-        node.create_subscription(interface(kind), topic, lambda message: take(topic, message), qos)
+        if is_kept:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        silent = SubscriptionEventCallbacks(use_default_callbacks=False)  # which warn in the midst of our JSON
+        node.create_subscription(
+            interface(kind), topic, lambda message: take(topic, message), qos, event_callbacks=silent
+        )
 
     def publish(topic: str, kind: str, values: dict[str, Any], is_stamped: bool = True, age_s: float = 0.0) -> None:
         if topic not in made:
@@ -183,6 +190,17 @@ def main() -> None:
         made[f"{topic} {parent}"] = node.create_publisher(type(message), topic, kept)
         made[f"{topic} {parent}"].publish(message)
 
+    def run_clock(rate: float) -> None:
+        """Publish a simulation's time on /clock, which passes at `rate` times the wall clock's."""
+        publisher, began_s = node.create_publisher(interface("rosgraph_msgs/msg/Clock"), "/clock", 1), time.monotonic()
+
+        def tick() -> None:
+            now_s, message = 100.0 + rate * (time.monotonic() - began_s), interface("rosgraph_msgs/msg/Clock")()
+            message.clock.sec, message.clock.nanosec = int(now_s), int(now_s % 1 * 1e9)
+            publisher.publish(message)
+
+        node.create_timer(0.02, tick)
+
     def withdraw(topic: str) -> None:
         node.destroy_publisher(made.pop(topic))
 
@@ -196,7 +214,7 @@ def main() -> None:
         "subscribe": subscribe, "publish": publish, "call": call, "since": since, "publishers": publishers,
         "withdraw": withdraw, "send_frames": send_frames, "send_goal": send_goal, "goal": goal, "cancel": cancel,
         "parameter": parameter, "set_parameter": set_parameter, "offered": offered,
-        "lead": lead, "arrived": lambda topic: arrived[topic],
+        "lead": lead, "run_clock": run_clock, "arrived": lambda topic: arrived[topic],
     }  # fmt: skip
     print(json.dumps("ready"), flush=True)
     for line in sys.stdin:

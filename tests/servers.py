@@ -16,8 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -109,12 +108,6 @@ def over_uvicorn(app: Any, port: int = 0) -> Iterator[int]:
         finally:
             server.should_exit = True
             thread.join()
-
-
-@pytest.fixture(scope="session")
-def served() -> Callable[[Any], AbstractContextManager[int]]:
-    """`over_uvicorn`."""
-    return over_uvicorn
 
 
 @contextlib.contextmanager

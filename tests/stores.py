@@ -14,9 +14,9 @@ from rlservo.policy.policy import Policy
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.deployment_plan import Plan, PolicyPlan, ServedConfig
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.plan_follower import VersionState
+from rlservo.serve_app.versions.policy_store import PolicyStore
 
 
 def load_store(*folders: Path, options: Mapping[str, PolicyOptions] | None = None) -> PolicyStore:

@@ -81,6 +81,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         "rlservo/client", "rlservo/drive", "rlservo/robots", "envs", "envs/ur", "envs/robot_server",
         "deploy/terminal.py",
     },
+    "deploy/page": {
+        "rlservo/errors.py", "rlservo/bundle", "rlservo/policy", "rlservo/drive", "rlservo/robots", "envs", "envs/ur",
+        "envs/mir100", "envs/panda", "export",
+    },
     "deploy/ros2": {
         "rlservo/errors.py", "rlservo/bundle", "rlservo/policy/acting_policy.py", "rlservo/drive", "rlservo/robots",
     },
@@ -299,6 +303,7 @@ SAME_FILE_NAME = {
     },
     "one for each API stack of RLlib": {"connectors.py", "policy.py"},
     "a command, and its work": {"compile.py", "demo.py", "policy.py", "replay.py", "robot_server.py"},
+    "a bundle's page, and the cockpit's": {"page.py"},
 }  # fmt: skip
 SAME_CLASS_NAME = {
     "an RLlib connector, and the step of a recipe that it becomes": {"Logarithm", "SineAndCosine"},

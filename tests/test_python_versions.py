@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import ast
+import platform
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from environments import find_python, virtual_environment
+from rlservo.robots.arm_interface import no_driver
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("rlservo", "envs", "export", "serve_app", "deploy", "examples")
@@ -92,6 +96,22 @@ def test_base_and_client_run_on_every_python_that_is_named(minor: str, ur5: Path
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("refused\nacted (6,)\n") and "algorithm" in done.stdout
+
+
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
+@pytest.mark.parametrize("minor", CLASSIFIER.findall(project()))
+def test_missing_arm_driver_is_installed_where_it_has_a_wheel(
+    minor: str, machine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Elsewhere the extra leaves it out, and the sentence names what to do instead."""
+    (line,) = (one for one in requirements("ur") if one.startswith("ur-rtde"))
+    here = {"python_version": f"3.{minor}", "platform_machine": machine}
+    has_wheel = Requirement(line).marker.evaluate(here)  # type: ignore[union-attr]  # it has one
+    monkeypatch.setattr(sys, "version_info", (3, int(minor), 0))
+    monkeypatch.setattr(platform, "machine", lambda: machine)
+    assert has_wheel == (machine == "x86_64" and minor in ("11", "12"))
+    assert has_wheel == no_driver().endswith("pip install '.[ur]' in the checkout of rlservo")
+    assert has_wheel != (f"this is Python 3.{minor} on {machine}: use one of these, compile it" in no_driver())
 
 
 @pytest.mark.parametrize(

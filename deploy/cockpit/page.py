@@ -22,7 +22,7 @@ import numpy as np
 import viser
 import websockets.asyncio.server
 
-from rlservo.deploy.cockpit.inputs import checked_messages, point_of
+from rlservo.deploy.cockpit.message_checks import checked_messages, point_of
 from rlservo.deploy.cockpit.stage import Vector
 from rlservo.errors import UsageError
 

@@ -15,7 +15,7 @@ import viser
 
 from rlservo.bundle.contract import Contract
 from rlservo.deploy.cockpit.drive import Drive
-from rlservo.deploy.cockpit.inputs import number_of
+from rlservo.deploy.cockpit.message_checks import number_of
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.policies import FALLBACKS, Choice, PolicySource, ServerLink
 from rlservo.deploy.cockpit.readings import Readings, escape

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from rlservo.deploy.cockpit.inputs import number_of
+from rlservo.deploy.cockpit.message_checks import number_of
 from rlservo.deploy.cockpit.page import aim_cameras, set_value
 from rlservo.deploy.cockpit.readings import Readings, escape
 from rlservo.deploy.cockpit.scenery import LEGEND, Scenery

@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 import viser
 
-from rlservo.deploy.cockpit.inputs import point_of
 from rlservo.deploy.cockpit.meshes import beam_mesh, floor_lines, shape_mesh
+from rlservo.deploy.cockpit.message_checks import point_of
 from rlservo.deploy.cockpit.stage import Scene, Stage, Vector
 from rlservo.envs.shapes import Poses, Shape, body_poses, moving_bodies, visible_shapes
 

@@ -19,7 +19,7 @@ from rlservo.envs.randomization import DomainRandomization, wrapped_env
 from rlservo.envs.rendering import RenderedEnv, Start
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies
 from rlservo.errors import UsageError
-from rlservo.robots.checks import InvalidResetError
+from rlservo.robots.argument_checks import InvalidResetError
 
 Vector = NDArray[np.float64]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
@@ -30,8 +31,9 @@ Target = Annotated[
     str | None,
     typer.Option(
         metavar="FRAME:NUMBERS",
-        help="Target of rlservo's own robots. Arm: base_link:X,Y,Z or base:X,Y,Z (the pendant's frame; m, and "
-        "ROLL,PITCH,YAW in rad), or joints:... (6, rad), the flange's pose there. Base: odom:X,Y or base_link:X,Y (m).",
+        help="Target for rlservo's own robots. Arm: base_link:X,Y,Z or base:X,Y,Z (the pendant's frame) in m, with "
+        ",ROLL,PITCH,YAW in rad for a task with an orientation; or joints:... (6, rad), for the flange's pose there. "
+        "Base: odom:X,Y or base_link:X,Y in m.",
     ),
 ]
 
@@ -41,7 +43,10 @@ def require_robot(robot: str) -> None:
     if robot.startswith("rosbridge://"):
         require("rosbridge", "roslibpy", what="a rosbridge")
     elif not robot.startswith("ros2:"):  # which names its own lack: ROS 2 is no package of PyPI's
-        require("ur", "rtde_control", what="a real robot")
+        from rlservo.robots.arm_interface import no_driver
+
+        if find_spec("rtde_control") is None:
+            raise UsageError(no_driver())
 
 
 def choose_gl_backend() -> None:

@@ -73,7 +73,7 @@ def learn(
     app_dir: Annotated[Path, typer.Option(help="Folder of the Python modules that the checkpoint refers to.")] = Path(),
     key_file: KeyFile = None,
 ) -> None:
-    """Train a served policy from the robots that use it.
+    """Train a served policy on the robots that use it.
 
     Robots use `policy` under the alias and explore; the server records them. Their whole episodes train the
     checkpoint's algorithm. Every few updates the result is exported, proven and published, the server loads it and the
@@ -100,7 +100,7 @@ def learn(
 
     def connect(url: str) -> AdminClient:
         try:
-            return AdminClient(url, api_key=find_key(url, key_file))
+            return AdminClient.of_operator(url, key_file)
         except UsageError as error:  # a server removes its key when it ends, and writes a new one when it restarts
             raise UnavailableError(error.message) from None
 

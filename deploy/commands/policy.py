@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +10,6 @@ import typer
 from rlservo.deploy import terminal
 from rlservo.deploy.commands.serve import split_pair, split_share
 from rlservo.deploy.terminal import Json, print_json
-from rlservo.errors import UnauthenticatedError
 from rlservo.extras import needs_extra
 
 if TYPE_CHECKING:
@@ -183,18 +180,10 @@ def shadow(
     _give(url, key_file, repository, as_json, name, "shadow", version=None if version == "off" else version)
 
 
-@contextlib.contextmanager
-def _client(url: str, key_file: Path | None) -> Iterator[AdminClient]:
+def _client(url: str, key_file: Path | None) -> AdminClient:
     with needs_extra("client"):
-        from rlservo.client.admin_client import AdminClient, find_key
-    with AdminClient(url, api_key=find_key(url, key_file)) as client:
-        try:
-            yield client
-        except UnauthenticatedError:
-            given = key_file or "RLSERVO_ADMIN_KEY, or in the file that 'rlservo serve' wrote here"
-            raise UnauthenticatedError(
-                f"{url} does not know the key in {given}: expected one of that server's keys"
-            ) from None
+        from rlservo.client.admin_client import AdminClient
+    return AdminClient.of_operator(url, key_file)
 
 
 def _repository(places: list[str]) -> OfflineCommands:

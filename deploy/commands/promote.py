@@ -75,7 +75,7 @@ def promote(
     from rlservo.bundle.contract import NAME_PATTERN, VERSION_PATTERN
 
     with needs_extra("client"):
-        from rlservo.client.admin_client import AdminClient, find_key
+        from rlservo.client.admin_client import AdminClient
         from rlservo.client.promotion import EXIT_CODES, Promotion, Terms
         from rlservo.client.promotion_evidence import PromotionLimits
         from rlservo.client.promotion_log import PromotionLog
@@ -103,7 +103,7 @@ def promote(
     file = log or Path(f"promote-{name}-{version}.jsonl")
 
     def connect(url: str) -> AdminClient:
-        return AdminClient(url, api_key=find_key(url, key_file))
+        return AdminClient.of_operator(url, key_file)
 
     with PromotionLog.open(file) as opened, _signals():
         try:

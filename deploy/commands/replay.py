@@ -58,7 +58,7 @@ def estimate(
     files: Files,
     bundle: Bundle,
     explore: Annotated[
-        bool, typer.Option("--explore", help="Estimate the exploring policy instead of the deterministic one.")
+        bool, typer.Option("--explore", help="Estimate the exploratory policy instead of the deterministic one.")
     ] = False,
     gamma: Annotated[float, typer.Option(help="Discount per step.")] = 1.0,
     version: Version = None,

@@ -19,6 +19,7 @@ from rlservo.robots.ur.parameters import UR_PARAMETERS
 
 if TYPE_CHECKING:
     from rlservo.envs.robot_server.robot_server_settings import Settings
+    from rlservo.robots.latency import LatencyReport
 
 robot_server = typer.Typer(
     help="Serve a robot to robo-gym, without ROS.",
@@ -186,7 +187,7 @@ def server_manager(
         int | None, typer.Option(min=1, max=65535, help="Port; the first free one of 50100 to 50199 by default.")
     ] = None,
     clock: Clock = "fast",
-    max_servers: Annotated[int, typer.Option(min=1, help="Limit of robot servers that run at once.")] = 100,
+    max_servers: Annotated[int, typer.Option(min=1, help="Largest number of robot servers at once.")] = 100,
     orphan_timeout: Annotated[
         float, typer.Option(min=0.0, help="Seconds without a client after which a robot server exits; 0: never.")
     ] = 120.0,
@@ -259,10 +260,17 @@ def robot_latency(
                 )
         finally:
             arm.close()
-        keep_latency_ms(robot, ur_model, report.max_ms)
+        if not report.fault:
+            keep_latency_ms(robot, ur_model, report.max_ms)
     if as_json:
         print_json(dataclasses.asdict(report) | {"disturbance": report.disturbance})
-        return
+    else:
+        _print_latency(report, control_rate, ur_model)
+    if report.fault:
+        raise UsageError(f"the measurement ended after {report.steps} motions: {report.fault}")
+
+
+def _print_latency(report: LatencyReport, control_rate: float, ur_model: str) -> None:
     motions, periods = report.latencies, report.periods
     terminal.output().print(
         f"command to motion: p50 {report.p50_ms:.0f}, p95 {report.p95_ms:.0f}, p99 {motions.p99_ms:.0f}, p99.9 "
@@ -287,6 +295,10 @@ def ur_controller(
     latency_ms: Annotated[float, typer.Option(min=0.0, help="Delay of the link in each direction.")] = 0.0,
     jitter_ms: Annotated[float, typer.Option(min=0.0, help="Largest additional delay (jitter).")] = 0.0,
     drop: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of RTDE data packages that are lost.")] = 0.0,
+    calibrated: Annotated[
+        bool,
+        typer.Option("--calibrated", help="Kinematics a few millimetres off the data sheet's, like a real arm's."),
+    ] = False,
 ) -> None:
     """Run the controller of a simulated UR arm until Ctrl-C. Lines on standard input stop the arm or cut the link.
 
@@ -295,8 +307,9 @@ def ur_controller(
     """
     with one_sentence_errors():
         from rlservo.robots.simulated.ur_controller.console import run
-        from rlservo.robots.simulated.ur_controller.controller import Controller
+        from rlservo.robots.simulated.ur_controller.controller import DEVIATIONS, Controller
         from rlservo.robots.simulated.ur_controller.controller_server import LinkFaults
+        from rlservo.robots.ur.calibration import data_sheet
 
         def ready() -> None:
             terminal.output().print(
@@ -308,7 +321,14 @@ def ur_controller(
 
         stop = threading.Event()
         with terminal.ctrl_c_sets(stop):
-            run(Controller(model), host, LinkFaults(latency_ms / 1e3, jitter_ms / 1e3, drop), stop, ready)
+            kinematics = data_sheet(model) + DEVIATIONS if calibrated else None
+            run(
+                Controller(model, kinematics=kinematics),
+                host,
+                LinkFaults(latency_ms / 1e3, jitter_ms / 1e3, drop),
+                stop,
+                ready,
+            )
 
 
 def _serve(settings: Settings, title: str) -> None:

@@ -31,7 +31,7 @@ def rollout(
     policy: Annotated[str | None, typer.Option(help="Policy name on that server; by default its only policy.")] = None,
     bundle: Annotated[Path | None, typer.Option(help="Act in process with this bundle instead of a server.")] = None,
     version: VersionOrAlias = None,
-    episodes: Annotated[int, typer.Option(min=1)] = 10,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes to drive.")] = 10,
     seed: Annotated[int | None, typer.Option(help="Seed; episode i is reset with seed + i.")] = None,
     rate: Annotated[
         Literal["real", "max"], typer.Option(help="real: at the control rate, as on a robot; max: at full speed.")

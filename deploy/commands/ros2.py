@@ -70,7 +70,13 @@ def ros2(
     terminal.show_log()
     _pass_ros_arguments(ros_args or [], mapping)
     with needs_extra("sim", "mujoco", "gymnasium"):
-        from rlservo.deploy.ros2.node import PolicyNode, drive_elements, drive_environment, real_environment
+        from rlservo.deploy.ros2.node import (
+            PolicyNode,
+            check_takes_targets,
+            drive_elements,
+            drive_environment,
+            real_environment,
+        )
         from rlservo.deploy.ros2.parameters import with_parameters
         from rlservo.robots.arm_interface import RobotError
         from rlservo.robots.ros2.rclpy_link import RclpyLink
@@ -92,6 +98,8 @@ def ros2(
             node.on_connected = lambda: cleanup.enter_context(terminal.ctrl_c_sets(node.stop))
             terminal.note(f"node /{name}: policy {acting.contract.name} {acting.contract.version}; Ctrl-C ends it")
             ours = real_environment(acting.contract)
+            if not node.mapped():
+                check_takes_targets(acting.contract)
             if ours is not None and not node.mapped():
                 arguments = ours[1] | parse_env_arguments(chosen["env_arg"] or [])
                 arguments |= {"robot": chosen["robot"], "confirm": False}

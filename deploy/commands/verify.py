@@ -43,9 +43,7 @@ def verify(
     source: Annotated[str | None, typer.Option(help="Trainer that wrote --checkpoint; detected by default.")] = None,
     vecnormalize: Annotated[
         Path | None,
-        typer.Option(
-            help="Stable-Baselines3: vecnormalize.pkl, if it is not beside the checkpoint; `none` as in the export."
-        ),
+        typer.Option(help="Stable-Baselines3: path of vecnormalize.pkl or `none`, as given to `rlservo export`."),
     ] = None,
     env: Annotated[str | None, typer.Option(help="Environment id for a closed-loop comparison.")] = None,
     disturb: Annotated[
@@ -96,6 +94,7 @@ def verify(
         raise UsageError("expected --checkpoint to compare the bundle with, or --env with --disturb or --compiled")
     from rlservo.bundle.bundle import digest_of
     from rlservo.export.checkpoints.unpickle import user_code
+    from rlservo.serve_app.repository.signature import remove_signature
 
     bundle, document = bundle_of(bundle, version), dict[str, Any]()
     before = digest_of(bundle)
@@ -121,6 +120,8 @@ def verify(
         if not as_json:
             _show(table)
     if digest_of(bundle) != before:
+        if remove_signature(bundle):
+            note(f"the signature was of the bundle without its new evaluations and is removed: `rlservo sign {bundle}`")
         _accept(bundle, before)
     if as_json:
         print_json(document)

@@ -186,7 +186,12 @@ def _ray_serve(repository: Path, out: Path) -> _Command:
     }
     file = out / "serve.yaml"
     file.write_text(json.dumps({"http_options": {"host": "127.0.0.1", "port": port}, "applications": [application]}))
-    switches = {"RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1", "RAY_AUTH_MODE": "token"}
+    switches = {
+        "RAY_SERVE_ENABLE_HA_PROXY": "1",
+        "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1",
+        "RAY_AUTH_MODE": "token",
+        "RAY_worker_niceness": "0",
+    }
     shown = " ".join(f"{name}={value}" for name, value in switches.items())
     words = [sys.executable, "-m", "ray.serve.scripts", "run", str(file)]
     environment = {**switches, "RAY_ADDRESS": "local", "RAY_USAGE_STATS_ENABLED": "0"}

@@ -46,7 +46,9 @@ class ServerRecordings:
             there = client.recordings()
             for name, size in there.items():
                 if not FILE_NAME.match(name):
-                    raise UnavailableError(f"the server names a recording {name[:100]!r}: is it rlservo?")
+                    raise UnavailableError(
+                        f"the server lists a recording named {name[:100]!r}: is it an rlservo server?"
+                    )
                 with (self.folder / name).open("ab") as file:
                     while file.tell() < size and (piece := client.recording(name, file.tell())):
                         file.write(piece)

@@ -56,6 +56,9 @@ REAL = {
     "ObstacleAvoidanceMir100Sim-v0": ("ObstacleAvoidanceMir100Rob-v0", "target_pose", "odom"),
 }
 
+# The same of those whose targets this node does not take: they have orientations.
+BY_ROLLOUT = {"IsaacDeployReachURSim-v0": "IsaacDeployReachURRob-v0"}
+
 # Arguments of a policy's environment that say what its elements mean, and which robot it is for.
 MEANINGS = ("ur_model", "restrict_wrist_1", "action_cycle_rate", "max_velocity_scale_factor", *(
     f"fix_{joint}" for joint in JOINTS
@@ -67,9 +70,22 @@ log = logging.getLogger("rlservo.ros2")
 
 def real_environment(contract: Contract) -> tuple[str, dict[str, Any]] | None:
     """Return the simulated environment of ours that a policy was trained in and its arguments; None for others."""
-    config = contract.provenance.env_config
-    name = str(config.get("env_id") or contract.provenance.env_id).rpartition("/")[2]
+    config, name = contract.provenance.env_config, _trained_in(contract)
     return (name, {key: config[key] for key in MEANINGS if key in config}) if name in REAL else None
+
+
+def check_takes_targets(contract: Contract) -> None:
+    """Raise UsageError for a policy of a built-in environment that has a robot, which this node does not drive."""
+    if real := BY_ROLLOUT.get(_trained_in(contract)):
+        raise UsageError(
+            f"the targets of policy {contract.name!r} have orientations, which this node does not take: drive it by "
+            f"rlservo rollout rlservo/{real} --env-arg robot=ros2: or map its elements (--mapping)"
+        )
+
+
+def _trained_in(contract: Contract) -> str:
+    config = contract.provenance.env_config
+    return str(config.get("env_id") or contract.provenance.env_id).rpartition("/")[2]
 
 
 class Wanted(str, Enum):

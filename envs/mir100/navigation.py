@@ -17,7 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.mir100.sensor_errors import sensor_errors
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv, Start
-from rlservo.robots.checks import ElementInfo, EnvDescription, as_vector, check_action, check_option_names, parse_target
+from rlservo.robots.argument_checks import (
+    ElementInfo,
+    EnvDescription,
+    as_vector,
+    check_action,
+    check_option_names,
+    parse_target,
+)
 from rlservo.robots.disturbable import SensorError
 from rlservo.robots.mir100.lasers import pick_beams
 from rlservo.robots.mir100.parameters import (

@@ -10,7 +10,7 @@ import numpy as np
 
 from rlservo.envs.mir100.navigation import Mir100Navigation
 from rlservo.envs.rendering import Start
-from rlservo.robots.checks import InvalidResetError, as_vector
+from rlservo.robots.argument_checks import InvalidResetError, as_vector
 from rlservo.robots.disturbable import Extreme
 from rlservo.robots.mir100.parameters import LENGTH, WIDTH
 from rlservo.robots.mir100.simulation import ROOM_VIEW

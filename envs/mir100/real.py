@@ -18,7 +18,7 @@ from rlservo.envs.mir100.navigation import (
 from rlservo.envs.mir100.no_obstacle_navigation import BOUNDARY, NoObstacleNavigationMir100Sim
 from rlservo.envs.mir100.obstacle_avoidance import ObstacleAvoidanceMir100Sim
 from rlservo.envs.rendering import Start
-from rlservo.robots.checks import InvalidResetError
+from rlservo.robots.argument_checks import InvalidResetError
 from rlservo.robots.mir100.parameters import CYCLE_S
 from rlservo.robots.mir100.worlds import EMPTY, Pose
 from rlservo.robots.ros2.real_base import RealMir100

@@ -50,11 +50,11 @@ class SparseFixNavigationMir100Sim(NoObstacleNavigationMir100Sim):
     def __init__(self, *, fix_interval: int = FIX_INTERVAL, **arguments: Any) -> None:
         if isinstance(fix_interval, bool) or not isinstance(fix_interval, int) or fix_interval < 1:
             raise ValueError(f"fix_interval is {fix_interval!r}: expected a whole number of control cycles, 1 or more")
-        self._fix_interval = fix_interval
+        self.fix_interval = fix_interval
         super().__init__(**arguments)
 
     def _observation(self, distance: float, bearing: float) -> Observation:
         observation = super()._observation(distance, bearing)
-        if self._steps % self._fix_interval:
+        if self._steps % self.fix_interval:
             observation[0:2] = 0.0
         return observation

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rlservo.envs.elements import joint_elements
 from rlservo.envs.panda.server_state import state_dict
 from rlservo.envs.ur.arm_env import POSITION_BOUND, ArmEnv, Observation, Vector
-from rlservo.robots.checks import ElementInfo
+from rlservo.robots.argument_checks import ElementInfo
 from rlservo.robots.panda.model import HIGH, JOINTS, LOW
 from rlservo.robots.panda.simulation import PandaSimulation
 from rlservo.robots.ur.model import Table

@@ -15,7 +15,7 @@ from rlservo.envs.elements import point_elements, polar_elements
 from rlservo.envs.panda.arm_env import CENTRE, HALF, PandaArmEnv
 from rlservo.envs.ur.arm_env import POSITION_BOUND, Observation, Vector, polar
 from rlservo.envs.ur.sensor_errors import JOINT_BIAS, JOINT_NOISE, VELOCITY_NOISE, polar_errors, position_errors
-from rlservo.robots.checks import ElementInfo, as_vector
+from rlservo.robots.argument_checks import ElementInfo, as_vector
 from rlservo.robots.disturbable import SensorError
 from rlservo.robots.panda.model import HIGH, JOINTS, LOW
 

@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlservo.envs.elements import joint_elements
 from rlservo.envs.rendering import RENDER_MODES, Camera, RenderedEnv
 from rlservo.envs.ur.server_state import state_dict
-from rlservo.robots.arm_interface import MUJOCO
-from rlservo.robots.checks import (
+from rlservo.robots.argument_checks import (
     ElementInfo,
     EnvDescription,
     InvalidResetError,
@@ -29,12 +28,13 @@ from rlservo.robots.checks import (
     check_option_names,
     parse_target,
 )
+from rlservo.robots.arm_interface import MUJOCO
 from rlservo.robots.connect_arm import connect_arm
 from rlservo.robots.kept_latency import kept_latency_ms
 from rlservo.robots.robot_port import Arm
 from rlservo.robots.ur.model import BASE_HEIGHT, Table
 from rlservo.robots.ur.parameters import JOINT_NAMES, JOINTS, POSITION_LIMITS, cycle_of
-from rlservo.robots.ur.simulation import VIEW, ArmSimulation, URSimulation
+from rlservo.robots.ur.simulation import MIN_TRAJECTORY_S, VIEW, ArmSimulation, URSimulation
 
 if TYPE_CHECKING:
     from rlservo.robots.real_arm import RealArm
@@ -50,7 +50,7 @@ TARGET_FORMS = {
     "base": ("X,Y,Z", "X,Y,Z,ROLL,PITCH,YAW"),
     "joints": ("BASE,SHOULDER,ELBOW,WRIST_1,WRIST_2,WRIST_3",),
 }
-FRONT = math.pi / 4  # [rad], on either side of base_link's x axis, of a real arm's random targets
+FRONT = math.pi / 4  # [rad], on either side of where a task looks to, of a real arm's random targets
 
 Observation = NDArray[np.float32]
 Vector = NDArray[np.float64]
@@ -309,6 +309,8 @@ class URArmEnv(ArmEnv[URSimulation]):
     TABLE: ClassVar[Table]
     WITHIN: ClassVar[float] = 0.0  # [m], of the target, for a success; 0: a task without a target
     TARGET_TURN: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # [rad], roll, pitch and yaw, of one given as a position
+    FRONT_FRAME: ClassVar[str] = "base_link"  # along whose x axis the task's random targets are, or "base"
+    MIN_TRAJECTORY_S: ClassVar[float] = MIN_TRAJECTORY_S  # of the simulation
 
     def __init__(
         self,
@@ -351,6 +353,7 @@ class URArmEnv(ArmEnv[URSimulation]):
             objects=self.OBJECTS,
             table=self.TABLE,
             tool=self.TOOL,
+            min_trajectory_s=self.MIN_TRAJECTORY_S,
         )
         self.is_real = robot != MUJOCO
         self.robot_facts = {"ur_model": ur_model, "action_cycle_rate": rate_hz, "max_velocity_scale_factor": scale}
@@ -419,8 +422,10 @@ class URArmEnv(ArmEnv[URSimulation]):
         if frame == "joints":
             position, axes, _ = self.simulation.tool_frame_at(numbers)
             return np.concatenate([position, roll_pitch_yaw(axes)])
-        pose = np.concatenate([numbers, self.TARGET_TURN])[:6]
-        return pose if frame == "base_link" else pose * (-1, -1, 1, 1, 1, 1) + (0, 0, 0, 0, 0, math.pi)
+        if frame == "base":
+            count = len(numbers)
+            numbers = numbers * (-1, -1, 1, 1, 1, 1)[:count] + (0, 0, 0, 0, 0, math.pi)[:count]
+        return np.concatenate([numbers, self.TARGET_TURN])[:6]
 
     def _aim(self, arm: RealArm, start: Vector) -> str:
         """Choose a real arm's target before it moves to `start` [rad] (6,). Raises InvalidResetError, naming why not.
@@ -431,7 +436,7 @@ class URArmEnv(ArmEnv[URSimulation]):
         words, why = "in front of the robot", "it is too near to the start"
         for _ in range(REDRAWS):
             pose = self._random_pose() if asked is None else asked
-            x, y, _z = pose[:3].tolist()
+            x, y = pose[:2].tolist() if self.FRONT_FRAME == "base_link" else (-pose[:2]).tolist()
             if asked is None and (abs(math.atan2(y, x)) > FRONT or math.dist(tool, pose[:3]) < 2.0 * self.WITHIN):
                 continue
             words = "(" + ", ".join(f"{value:.2f}" for value in pose[:3] + 0.0) + ") m in base_link"
@@ -444,6 +449,15 @@ class URArmEnv(ArmEnv[URSimulation]):
             if asked is not None:
                 break
         raise InvalidResetError(f"the target {words} cannot be reached: {why}")
+
+
+class RealArmEnv(URArmEnv):
+    """A task on a real arm: its address is required."""
+
+    def __init__(self, *, robot: str = "", **arguments: Any) -> None:
+        if not robot:
+            raise ValueError("robot is missing: expected the arm's address, such as robot=rtde://192.168.0.2")
+        super().__init__(robot=robot, **arguments)
 
 
 def roll_pitch_yaw(axes: Vector) -> Vector:

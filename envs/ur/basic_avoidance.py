@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlservo.envs.elements import joint_elements, polar_elements
 from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector, polar
 from rlservo.envs.ur.sensor_errors import joint_errors, polar_errors
-from rlservo.robots.checks import ElementInfo, InvalidResetError, as_vector
+from rlservo.robots.argument_checks import ElementInfo, InvalidResetError, as_vector
 from rlservo.robots.disturbable import SensorError
 from rlservo.robots.ur.object_paths import object_path
 from rlservo.robots.ur.parameters import JOINT_NAMES

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rlservo.envs.elements import joint_elements
 from rlservo.envs.ur.arm_env import LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector
-from rlservo.robots.checks import ElementInfo
+from rlservo.robots.argument_checks import ElementInfo
 from rlservo.robots.ur.parameters import JOINT_NAMES
 
 

@@ -11,9 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlservo.envs.elements import joint_elements, point_elements, polar_elements
 from rlservo.envs.rendering import Start
-from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, REDRAWS, Observation, URArmEnv, Vector, polar
+from rlservo.envs.ur.arm_env import (
+    BASE,
+    LIMITS,
+    POSITION_BOUND,
+    REDRAWS,
+    Observation,
+    RealArmEnv,
+    URArmEnv,
+    Vector,
+    polar,
+)
 from rlservo.envs.ur.sensor_errors import joint_errors, polar_errors, position_errors, velocity_errors
-from rlservo.robots.checks import ElementInfo, InvalidResetError, as_vector
+from rlservo.robots.argument_checks import ElementInfo, InvalidResetError, as_vector
 from rlservo.robots.disturbable import Extreme, SensorError
 from rlservo.robots.ur.parameters import JOINT_NAMES
 
@@ -270,7 +280,7 @@ class EndEffectorPositioningURSim(URArmEnv):
         return {"target_coord": self._target.copy()}
 
 
-class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
+class EndEffectorPositioningURRob(RealArmEnv, EndEffectorPositioningURSim):
     """The same task on a real arm: `robot` is for example 'rtde://192.168.0.2'.
 
     Observations, actions, rewards and endings are the simulated environment's, computed from the measured joints; a
@@ -283,8 +293,3 @@ class EndEffectorPositioningURRob(EndEffectorPositioningURSim):
     `metrics` (HOST:PORT at which Prometheus reads state and limits), and `info["robot"]`: the state, its changes, and
     the limits that applied since the last step.
     """
-
-    def __init__(self, *, robot: str = "", **arguments: Any) -> None:
-        if not robot:
-            raise ValueError("robot is missing: expected the arm's address, such as robot=rtde://192.168.0.2")
-        super().__init__(robot=robot, **arguments)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from rlservo.envs.elements import joint_elements, point_elements, quaternion_elements
 from rlservo.envs.ur.arm_env import BASE, LIMITS, POSITION_BOUND, Observation, URArmEnv, Vector
 from rlservo.envs.ur.sensor_errors import JOINT_BIAS, JOINT_NOISE, velocity_errors
-from rlservo.robots.checks import ElementInfo, as_vector
+from rlservo.robots.argument_checks import ElementInfo, as_vector
 from rlservo.robots.disturbable import SensorError
 from rlservo.robots.ur.parameters import JOINT_NAMES, JOINTS
 
@@ -86,6 +86,7 @@ class IsaacReachURSim(URArmEnv):
     FIXED = ()
     TOOL = "tool1"
     START_JOINTS = DEFAULT_JOINTS
+    START_RANGE: ClassVar[float] = START_RANGE
     WITHIN = SUCCESS_DISTANCE
     TARGET_TURN = (0.0, TARGET_PITCH, 0.0)
     MAX_STEPS = 600
@@ -112,7 +113,7 @@ class IsaacReachURSim(URArmEnv):
         self._target: Vector = np.zeros(3)
         self._quaternion: Vector = np.array([1.0, 0.0, 0.0, 0.0])  # the target's, w, x, y, z
         self._target_rotation: Vector = np.eye(3)
-        self._yaw = 0.0
+        self._yaw = 0.0  # [rad], the target's
         self._command: Vector = np.zeros(6)
         self._end: Vector | None = None  # where an episode ended, if the next one may begin there
 
@@ -185,10 +186,10 @@ class IsaacReachURSim(URArmEnv):
         elif self._end is not None and self._continues:
             return self._place_arm_at(self._end)
         else:
-            centre = np.array(DEFAULT_JOINTS)
+            centre = np.array(self.START_JOINTS)
         if not options.get("randomize_start", self._randomize_start):
             return self._place_arm_at(centre)
-        return self._place_arm_around(centre, START_RANGE)
+        return self._place_arm_around(centre, self.START_RANGE)
 
     def _begin(self, options: Mapping[str, Any]) -> None:
         del options

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rlservo.bundle.contract import REWARD
-from rlservo.export.graph.observation_nodes import ObservationNode, as_dtype, observation_nodes
-from rlservo.export.recipe.recipe import Affine, Recipe, leaf_transform, parameter_count
+from rlservo.export.graph.observation_preprocessing import ObservationNode, as_dtype, observation_nodes
+from rlservo.export.recipe.recipe import Affine, Present, Recipe, leaf_transform, parameter_count
 from rlservo.export.recipe.trees import Tree, build, map_tree, named_leaves
 
 
@@ -48,6 +48,7 @@ class PolicyGraph(nn.Module):
         self.steps: nn.ModuleList = observation_nodes(recipe)
         self.network = network
         self.action = ActionNode(recipe)
+        self.present = None if recipe.present is None else PresentNode(recipe.present)
         self.action_count = len(recipe.action_leaves) if recipe.mode == "given" else 0
         self.state_names = [state.name for state in recipe.state]
         self.network_state_names = [state.name for state in recipe.network_state]
@@ -81,6 +82,8 @@ class PolicyGraph(nn.Module):
         chosen, outputs = outputs[: self.action_count], outputs[self.action_count :]
         named, next_state = outputs[: len(self.network.names)], outputs[len(self.network.names) :]
         actions = self.action.finish(chosen) if chosen else self.action(named[0])
+        if self.present is not None:
+            actions = (self.present(actions[0], inputs[0]),)
         if "previous_actions" in state:
             state["previous_actions"] = _append_code(state["previous_actions"], actions[0], self.action.choices)
         state.update(zip(self.network_state_names, next_state, strict=True))
@@ -149,6 +152,31 @@ class AffineNode(nn.Module):
         if self.limit is not None:
             action = torch.clamp(action, -self.limit, self.limit)
         return action * self.scale + self.offset
+
+
+class PresentNode(nn.Module):
+    """Relative actions as targets: clipped, then added to the positions in the observation."""
+
+    scale: Tensor
+    offset: Tensor
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, present: Present) -> None:
+        super().__init__()
+        self.columns, self.clips = list(present.columns), present.clips
+        self.is_plain = bool((present.scale == 1).all() and (present.offset == 0).all())
+        for name in ("scale", "offset", "low", "high"):
+            self.register_buffer(name, torch.tensor(getattr(present, name)))
+
+    def forward(self, action: Tensor, obs: Tensor) -> Tensor:
+        """Return targets `[batch, n]` for relative actions, the same, and observations `[batch, elements]`."""
+        if self.clips:
+            action = torch.minimum(torch.maximum(action, self.low), self.high)
+        first, last = self.columns[0], self.columns[-1] + 1
+        run = self.columns == list(range(first, last))
+        positions = obs[:, first:last] if run else obs[:, self.columns]
+        return action + (positions if self.is_plain else positions * self.scale + self.offset)
 
 
 class ActionLeaf(nn.Module):

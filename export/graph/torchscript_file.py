@@ -56,4 +56,4 @@ def run_torchscript(file: Path, inputs: Sequence[str], outputs: Sequence[str]) -
 
 
 def _ignore_deprecation() -> None:
-    warnings.filterwarnings("ignore", r"`torch\.jit\.\w+` is deprecated", DeprecationWarning)
+    warnings.filterwarnings("ignore", r"`torch\.jit\.\w+` is (deprecated|not supported)", DeprecationWarning)

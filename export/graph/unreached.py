@@ -10,7 +10,7 @@ import torch
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from rlservo.export.graph.observation_nodes import FilterNode
+from rlservo.export.graph.observation_preprocessing import FilterNode
 from rlservo.export.graph.policy_graph import PolicyGraph
 from rlservo.export.recipe.recipe import Recipe, leaf_transform
 from rlservo.export.recipe.runners import Inputs, Outputs
@@ -23,7 +23,7 @@ def unreached(
 
     `inputs` are the graph's, `answers` the framework's own; `labels` name the action's elements.
     """
-    return [*_clips(graph, inputs), *_bounds(recipe, answers, labels)]
+    return [*_clips(graph, inputs), *_bounds(recipe, inputs, answers, labels)]
 
 
 def _clips(graph: PolicyGraph, inputs: Sequence[Inputs]) -> Iterator[str]:
@@ -50,14 +50,20 @@ def _clips(graph: PolicyGraph, inputs: Sequence[Inputs]) -> Iterator[str]:
             yield f"{node.leaf}: the filter's clip at {node.clip:g} ({missing} of {sides[0].numel()} elements)"
 
 
-def _bounds(recipe: Recipe, answers: Sequence[Outputs], labels: Sequence[str]) -> Iterator[str]:
+def _bounds(
+    recipe: Recipe, inputs: Sequence[Inputs], answers: Sequence[Outputs], labels: Sequence[str]
+) -> Iterator[str]:
     """Yield the action's bounds that the framework's own actions never reached."""
     for name, space in recipe.action_leaves.items():
         if not isinstance(space, Box):
             continue
         actions = np.concatenate([answer[name] for answer in answers])
+        slack: Any = 0.0
+        if recipe.present is not None:
+            positions = recipe.present.positions(np.concatenate([batch["obs"] for batch in inputs]))
+            actions, slack = actions - positions, 1e-6 * np.abs(positions)  # of the sum's rounding
         for side, bound, is_low in _limits(recipe, space):
-            hit = (actions <= bound if is_low else actions >= bound).any(axis=0)
+            hit = (actions <= bound + slack if is_low else actions >= bound - slack).any(axis=0)
             missing = np.flatnonzero(np.isfinite(bound) & ~hit).tolist()
             if missing:
                 which = [str(labels[index] if name == "action" and index < len(labels) else index) for index in missing]
@@ -75,3 +81,6 @@ def _limits(recipe: Recipe, space: Box) -> Iterator[tuple[str, NDArray[Any], boo
         ends = np.sort([recipe.affine.apply(np.full(space.shape, side, np.float32)) for side in (-np.inf, np.inf)], 0)
         yield "the clip below", ends[0], True
         yield "the clip above", ends[1], False
+    if recipe.present is not None:
+        yield "the relative action's lower bound", recipe.present.low, True
+        yield "the relative action's upper bound", recipe.present.high, False

@@ -2,7 +2,8 @@
 
 A difference passes when it is at most `RTOL * scale + ATOL`, or two last bits of the number itself. The scale is half
 the range of a bounded action element (and ATOL at most LARGEST of it); otherwise the largest number in the same row of
-the output, at least 1, because the rounding of a matrix product grows with its terms and not with their sum. `value`
+the output, at least 1, because the rounding of a matrix product grows with its terms and not with their sum; but no
+more than the largest number of the same action element, which may have another unit than the others. `value`
 has one number a row, which may be a small difference of large terms: its scale is the largest value seen over all
 observations. A discrete action must be the same, unless the framework's own scores for the two choices are that close.
 
@@ -38,8 +39,8 @@ LAST_BITS = 2 * float(np.finfo(np.float32).eps)
 RULE = (
     "a difference passes up to rtol * scale + atol, or the number's own last two bits; the scale is half the range of "
     "a bounded action (atol at most 1% of it), else the largest number in the output's row (of value: over all "
-    "observations), at least 1; also up to 8 times what the policy's own numbers move by when the observation or the "
-    "weights move by their last bit, at most 1% of the scale"
+    "observations), at least 1, but for an action no more than the element's own largest; also up to 8 times what the "
+    "policy's own numbers move by when the observation or the weights move by their last bit, at most 1% of the scale"
 )
 """Sentence of the contract on the tolerances."""
 
@@ -83,6 +84,11 @@ class Comparer:
         self._movements: list[Outputs] | None = None
         values = [reference.outputs["value"] for reference in references if "value" in reference.outputs]
         self._largest_value = max(map(_largest, values), default=1.0)
+        self._ranges = {
+            name: _range([reference.outputs[name] for reference in references])
+            for name, space in recipe.action_leaves.items()
+            if isinstance(space, Box) and not _is_bounded(space)
+        }
 
     def compare(self, number: int, got: Outputs, rows: slice = slice(None)) -> Comparison:
         """Compare `got` with some rows of the reference `number`."""
@@ -108,6 +114,7 @@ class Comparer:
             difference = np.where(same, 0.0, np.abs(a - b))
         least = self._largest_value if output == "value" else 1.0
         scale = np.broadcast_to(_scale(b, self._recipe.action_leaves.get(output), least), b.shape)
+        scale = np.minimum(scale, self._ranges.get(output, np.inf))
         size = np.where(np.isfinite(b), np.abs(b), 0.0)
         allowed = np.maximum(RTOL * scale + np.minimum(ATOL, LARGEST * scale), LAST_BITS * size)
         bad = ~(difference <= allowed)
@@ -164,12 +171,22 @@ class Comparer:
 
 def _scale(expected: NDArray[np.float64], space: Any, least: float) -> NDArray[np.float64]:
     """Return the scale that rounding is measured against, broadcastable to `expected`."""
-    if isinstance(space, Box) and bool((space.bounded_below & space.bounded_above).all()):
+    if isinstance(space, Box) and _is_bounded(space):
         return (space.high.astype(np.float64) - space.low.astype(np.float64))[None] / 2
     measured = np.isfinite(expected) & (np.abs(np.nan_to_num(expected)) < MASKED)
     finite = np.where(measured, np.abs(expected), 0.0)
     axes = tuple(range(1, expected.ndim))
     return np.maximum(finite.max(axis=axes, keepdims=True) if axes else finite, least)
+
+
+def _is_bounded(space: Box) -> bool:
+    return bool((space.bounded_below & space.bounded_above).all())
+
+
+def _range(batches: Sequence[NDArray[Any]]) -> NDArray[np.float64]:
+    """Return each element's largest number `[*shape]`, of which ATOL is at most the share LARGEST."""
+    largest = [np.nan_to_num(np.abs(batch.astype(np.float64)), posinf=0.0).max(axis=0) for batch in batches]
+    return np.asarray(np.maximum(np.max(largest, axis=0), ATOL / LARGEST), np.float64)
 
 
 def _largest(values: NDArray[Any]) -> float:

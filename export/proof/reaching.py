@@ -31,13 +31,13 @@ def reaching_batches(recipe: Recipe, run: Runner, seed: int) -> list[Batch]:
         return []
     candidates = draw_candidates(recipe, seed)
     if not recipe.state:
-        rows = _extremes(np.stack([_actions(run(candidates[0].inputs), names)]))
+        rows = _extremes(np.stack([_actions(recipe, candidates[0].inputs, run(candidates[0].inputs), names)]))
         return [candidates[0].row(row) for _, row in rows]
     loop = GraphLoop(run, recipe.state)
     steps = []
     for batch in candidates:
         assert batch.restart is not None
-        steps.append(_actions(loop.step(batch.inputs, batch.restart), names))
+        steps.append(_actions(recipe, batch.inputs, loop.step(batch.inputs, batch.restart), names))
     last: dict[int, int] = {}
     for step, row in _extremes(np.stack(steps)):
         last[row] = max(step, last.get(row, 0))
@@ -57,8 +57,12 @@ def _refusing(run: Runner) -> Runner:
     return run_or_refuse
 
 
-def _actions(outputs: Outputs, names: list[str]) -> NDArray[np.float64]:
-    return np.concatenate([outputs[name].reshape(len(outputs[name]), -1).astype(np.float64) for name in names], axis=1)
+def _actions(recipe: Recipe, inputs: Inputs, outputs: Outputs, names: list[str]) -> NDArray[np.float64]:
+    """Return the actions, without the present positions that are in them."""
+    actions = np.concatenate(
+        [outputs[name].reshape(len(outputs[name]), -1).astype(np.float64) for name in names], axis=1
+    )
+    return actions if recipe.present is None else actions - recipe.present.positions(inputs["obs"])
 
 
 def _extremes(actions: NDArray[np.float64]) -> Iterator[tuple[int, int]]:

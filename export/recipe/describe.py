@@ -53,6 +53,18 @@ def baked_steps(recipe: Recipe, module_class: str, module: Any, unread: Sequence
         steps.append(BakedStep(step="scale", detail=f"{limited}action * scale + offset", values=values))
     if any(leaf_transform(leaf, recipe.transform) != "none" for leaf in recipe.action_leaves.values()):
         steps.append(_transform_step(recipe))
+    if (present := recipe.present) is not None:
+        clipped = "clipped, then " if present.clips else ""
+        steps.append(
+            BakedStep(
+                step="present_position",
+                detail=f"{clipped}added to the positions in the observation",
+                values={
+                    name: [None if np.isinf(one) else one for one in np.asarray(values, float).tolist()]
+                    for name, values in vars(present).items()
+                },
+            )
+        )
     return tuple(steps)
 
 

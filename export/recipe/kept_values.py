@@ -96,6 +96,8 @@ def kept_values(value: Any, name: str = "", seen: set[int] | None = None) -> Ite
 def _of_attributes(value: Any, name: str, seen: set[int]) -> Iterator[tuple[str, Any]]:
     """Yield what is in an object's own attributes, and in the slots of a user's classes."""
     for key, item in list(getattr(value, "__dict__", {}).items()):
+        if key in functools.WRAPPER_ASSIGNMENTS:  # texts, which a copy of torch's own hooks loses
+            continue
         yield from kept_values(item, name if key in HOLDERS else f"{name}.{key}", seen)
     for base in type(value).__mro__:
         slots = vars(base).get("__slots__", ()) if _is_own(base) else ()

@@ -186,6 +186,31 @@ class Affine:
 
 
 @dataclass(frozen=True)
+class Present:
+    """Positions in the observation, a vector, to which an action is relative: their sum is the environment's action."""
+
+    columns: tuple[int, ...]
+    """The observation's element for each of the action's."""
+    scale: NDArray[np.float32]
+    """The position is `observation * scale + offset`, in the action's units; 0 for an action that is not relative."""
+    offset: NDArray[np.float32]
+    """Offset, of the action's shape."""
+    low: NDArray[np.float32]
+    """Clip of the relative action, before it is added."""
+    high: NDArray[np.float32]
+    """The clip's upper side."""
+
+    @property
+    def clips(self) -> bool:
+        """Whether the relative action is clipped."""
+        return bool(np.isfinite([self.low, self.high]).any())
+
+    def positions(self, obs: NDArray[Any]) -> NDArray[Any]:
+        """Return the present positions for observations `[..., n]`, in numpy."""
+        return np.asarray(obs[..., list(self.columns)] * self.scale + self.offset)
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Everything between a raw observation and `env.step`, except the network."""
 
@@ -205,6 +230,8 @@ class Recipe:
     """The user's own connectors between the distribution's mode and unsquashing."""
     affine: Affine | None = None
     """For an action that is one Box: its transform before it is clipped."""
+    present: Present | None = None
+    """For a Box action that is relative to a Box observation, last of all."""
 
     @property
     def filter(self) -> ObservationFilter | None:

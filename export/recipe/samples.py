@@ -24,6 +24,8 @@ BATCH_SIZES = (1, 2, 257)
 UNBOUNDED = 1e6  # a bound beyond this (CartPole's 3.4e38) does not describe the values that occur
 WIDE = 10.0  # standard deviations
 EXTREME = 1e3
+FAR, FAR_KIND = (-6.0, 4.0), "far"
+"""Exponents, and the kind, of further samples for a user's own steps, which are written twice: numpy and torch."""
 SEQUENCE_STEPS = {1: 12, 2: 100, 257: 5}  # a step costs the framework milliseconds, a row of it a tenth of one
 LARGE = 4096  # elements of an observation: such a network takes 0.1 s for a step, and TorchScript as much again
 LARGE_SEQUENCE_STEPS = {1: 12, 2: 24, 257: 2}
@@ -75,13 +77,14 @@ def draw_batches(recipe: Recipe, seed: int) -> list[Batch]:
     For a policy with a state all are sequences of SEQUENCE_STEPS batches of one size; of images, shorter ones.
     """
     rng = np.random.default_rng(seed)
-    if recipe.state:
-        return [
-            batch for size in BATCH_SIZES for batch in _sequence(recipe, rng, size, _kinds(rng, _steps(recipe, size)))
-        ]
     one, two, many = BATCH_SIZES
+    far = [FAR_KIND] if recipe.user_steps else []
+    if recipe.state:
+        kinds = {size: _kinds(rng, _steps(recipe, size)) + (far if size == many else []) for size in BATCH_SIZES}
+        return [batch for size in BATCH_SIZES for batch in _sequence(recipe, rng, size, kinds[size])]
     sizes = [many, *[one] * 4, *[two] * 2]
     batches = [Batch(kind, _observations(recipe, kind, rng, size)) for kind in KINDS for size in sizes]
+    batches += [Batch(kind, _observations(recipe, kind, rng, many)) for kind in far]
     return [*batches, *_sequence(recipe, rng, two, _kinds(rng, STATELESS_STEPS))]
 
 
@@ -157,7 +160,7 @@ def _draw(kind: str, leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArra
     if np.dtype(space.dtype).kind == "b":
         return np.asarray(rng.random((size, *space.shape)) < 0.5)
     largest = float(np.finfo(space.dtype).max)  # float16's is 65504
-    return np.clip(DRAWS[kind](leaf, rng, size), -largest, largest).astype(space.dtype)
+    return np.clip((_far if kind == FAR_KIND else DRAWS[kind])(leaf, rng, size), -largest, largest).astype(space.dtype)
 
 
 def _integers(kind: str, space: Box, rng: np.random.Generator, size: int) -> NDArray[Any]:
@@ -206,6 +209,14 @@ def _of_any_size(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np
     sizes = 10.0 ** rng.uniform(-2.0, 3.0, (size, *[1] * centre.ndim))
     drawn = centre + sizes * spread * rng.standard_normal((size, *centre.shape))
     return drawn if leaf.filtered_first else _within(leaf, drawn)
+
+
+def _far(leaf: _Leaf, rng: np.random.Generator, size: int) -> NDArray[np.float64]:
+    """Numbers of every size: one size for the whole row, or in half of the rows one for each element."""
+    shape = (size, *leaf.space.shape)
+    row = (size, *[1] * len(leaf.space.shape))
+    exponents = np.where(rng.random(row) < 0.5, rng.uniform(*FAR, row), rng.uniform(*FAR, shape))
+    return _within(leaf, rng.standard_normal(shape) * 10.0**exponents)
 
 
 DRAWS: dict[str, Callable[[_Leaf, np.random.Generator, int], NDArray[np.float64]]] = {

@@ -1,4 +1,4 @@
-"""Statistics of RLlib's running MeanStdFilter, which both API stacks' connectors hold, as the recipe's frozen one."""
+"""Statistics of RLlib's running MeanStdFilter, of both API stacks, as the recipe's frozen filter."""
 
 from __future__ import annotations
 

@@ -45,6 +45,9 @@ def _plain(loader: yaml.SafeLoader, suffix: str, node: yaml.Node) -> Any:
         return loader.construct_sequence(node, deep=True)
     if suffix.startswith("name:"):  # functions and classes, by their path
         return suffix.removeprefix("name:")
+    if suffix == "object/apply:builtins.slice" and isinstance(node, yaml.SequenceNode):
+        ends = loader.construct_sequence(node)
+        return slice(*ends) if len(ends) == 3 and all(end is None or isinstance(end, int) for end in ends) else ends
     return None
 
 
@@ -127,7 +130,7 @@ def action_terms(file: Path, size: int, limit: float | None, joint_order: Sequen
     terms: dict[str, _Term] = {}
     for name, term in settings.items():
         try:
-            terms[name] = _term(env, term, robot_joints(file, _asset(term), joint_order))
+            terms[name] = _term(env, term, robot_joints(file, env, asset_of(term), joint_order))
         except (ValueError, OverflowError, re.error) as error:
             raise CheckpointError(f"{file}: action term '{name}' {error}") from error
     elements = tuple(
@@ -140,7 +143,7 @@ def action_terms(file: Path, size: int, limit: float | None, joint_order: Sequen
             f"env.yaml's action terms ({', '.join(terms)}) have {len(elements)} elements, the policy's action "
             f"has {size}: they do not belong together"
         )
-    _compare(file, terms)
+    _compare(file, settings, terms, rate)
     scale = np.array([number for term in terms.values() for number in term.scale], np.float32)
     offset = np.array([number for term in terms.values() for number in term.offset], np.float32)
     return ActionTerms(Affine(scale, offset, limit), _bounds(terms), elements, rate, processed=True)
@@ -173,14 +176,21 @@ def clip_actions(agent_file: Path, agent: Mapping[str, Any]) -> float | None:
     return float(limit)
 
 
-def _asset(term: Mapping[str, Any]) -> str:
+def asset_of(term: Mapping[str, Any]) -> str:
+    """Return the name of the robot that an action term moves."""
     return str(term.get("asset_name") or term.get("entity_name") or "robot")
 
 
-def robot_joints(file: Path, asset: str, joint_order: Sequence[str]) -> Sequence[str] | None:
-    """Return a robot's joints in its own order, or None if neither a file nor the user has it."""
+def robot_joints(file: Path, env: Mapping[str, Any], asset: str, joint_order: Sequence[str]) -> Sequence[str] | None:
+    """Return a robot's joints in its own order, or None if neither a file nor the user has it.
+
+    `joint_order` is that of the one robot that the action moves, of `robot` if it moves several.
+    """
     if len(set(joint_order)) != len(joint_order):
         raise UsageError(f"the joint order names a joint twice: {', '.join(joint_order)}")
+    moved = {asset_of(term) for term in section(env, "actions", file).values() if isinstance(term, Mapping)}
+    if asset != (next(iter(moved)) if len(moved) == 1 else "robot"):
+        joint_order = ()
     described = file.parent.parent / DESCRIPTORS
     if not described.is_file():
         return joint_order or None
@@ -257,9 +267,19 @@ def match(patterns: Sequence[str], joints: Sequence[str], what: str, *, partly: 
     return found
 
 
+def selected(joints: Sequence[str], ids: Any) -> list[str]:
+    """Return the joints that `joint_ids` choose: a slice, numbers, or None for all. Raises ValueError."""
+    if ids is None or isinstance(ids, slice):
+        return list(joints[slice(None) if ids is None else ids])
+    numbers = [ids] if isinstance(ids, int) else ids
+    if not isinstance(numbers, list) or not all(isinstance(n, int) and 0 <= n < len(joints) for n in numbers):
+        raise ValueError(f"has the joint_ids {ids!r}: expected numbers of {len(joints)} joints")
+    return [joints[number] for number in numbers]
+
+
 def default_offset(env: Mapping[str, Any], term: Mapping[str, Any], key: str, joints: Sequence[str]) -> list[float]:
     """Return the default `key` of a term's robot. Raises ValueError if env.yaml does not have it."""
-    asset = _asset(term)
+    asset = asset_of(term)
     state = below(below(env.get("scene"), asset) or below(below(env.get("scene"), "entities"), asset), "init_state")
     values = below(state, key)
     if not isinstance(values, Mapping):
@@ -315,15 +335,30 @@ def _clip(given: Any, joints: Sequence[str]) -> list[tuple[float, float]] | None
     return sides
 
 
-def _compare(file: Path, terms: Mapping[str, _Term]) -> None:
-    """Raise CheckpointError where Isaac Lab's own description of the run has other joints or numbers."""
+def _compare(file: Path, settings: Mapping[str, Any], terms: Mapping[str, _Term], rate: float | None) -> None:
+    """Raise CheckpointError where Isaac Lab's own description of the run has other joints, numbers or commands."""
     described = file.parent.parent / DESCRIPTORS
-    actions = read_yaml(described).get("actions") if described.is_file() else None
+    given = read_yaml(described) if described.is_file() else {}
+    step = below(given.get("scene"), "dt")
+    if rate is not None and isinstance(step, int | float) and not np.isclose(step * rate, 1.0, rtol=1e-4):
+        raise CheckpointError(f"{file} has a control rate of {rate:g} Hz, but {described} steps of {step} s: they are "
+                              "not from the same run")  # fmt: skip
+    actions = given.get("actions")
     if not isinstance(actions, list) or len(actions) != len(terms):
         return  # terms may be left out of it
     for (name, term), action in zip(terms.items(), actions, strict=True):
-        for what, ours in (("joint_names", term.joints), ("scale", term.scale), ("offset", term.offset)):
-            theirs = below(action, what)
+        if not isinstance(action, Mapping):
+            continue
+        path = str(action.get("full_path") or "")
+        kinds = (_kind(settings[name]), class_name(path) if LIBRARIES.match(path) else "")
+        pairs: list[tuple[str, Any, Any]] = [
+            ("joint_names", term.joints, action.get("joint_names")),
+            ("scale", term.scale, action.get("scale")),
+            ("offset", term.offset, action.get("offset")),
+            ("clip", _ends(term.clip), _ends(action["clip"]) if "clip" in action else None),
+            ("class", [kinds[0]], [kinds[1]] if kinds[1] else None),
+        ]
+        for what, ours, theirs in pairs:
             if isinstance(theirs, int | float):
                 theirs = [theirs] * len(ours)
             if isinstance(theirs, list) and not _alike(ours, theirs):
@@ -331,6 +366,12 @@ def _compare(file: Path, terms: Mapping[str, _Term]) -> None:
                     f"action term '{name}' has the {what} {ours} in {file}, but {theirs} in {described}: they are not "
                     "from the same run"
                 )
+
+
+def _ends(clip: Any) -> list[Any]:
+    """Return a clip's ends one after the other, those that clip nothing left out."""
+    ends = [end for side in clip or () for end in (side if isinstance(side, list | tuple) else [side])]
+    return [end for end in ends if isinstance(end, int | float) and abs(end) <= LARGEST]
 
 
 def _alike(ours: list[Any], theirs: list[Any]) -> bool:

@@ -6,10 +6,13 @@ open: the name of the robot's base frame, and the order of a quaternion where th
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from rlservo.bundle.spaces import Axis, Element, Quantity
 from rlservo.errors import CheckpointError
@@ -23,6 +26,7 @@ from rlservo.export.sources.isaac_env import (
     read_yaml,
     robot_joints,
     section,
+    selected,
 )
 
 # Functions of joints: quantity, unit, and the key of the default that is subtracted.
@@ -46,6 +50,7 @@ BODY: dict[str, tuple[Quantity, str, tuple[Axis, ...], str]] = {
     "root_ang_vel_w": ("angular velocity", "rad/s", XYZ, "world"),
 }
 POSE_COMMAND, VELOCITY_COMMAND = "UniformPoseCommand", "UniformVelocityCommand"
+FARTHEST = 4 * math.pi  # [rad], of a joint from its default
 RELEASES = {"physx": "wxyz", "physics": "xyzw", "mujoco": "wxyz"}  # keys of env.yaml's sim
 IDENTITIES = {"wxyz": [1, 0, 0, 0], "xyzw": [0, 0, 0, 1]}
 
@@ -128,6 +133,9 @@ def _group(
             yield name
             continue
         elements = _term(env, file, name, kind, term, actions, joint_order, order)
+        sides = [side for side in term.get("clip") or () if isinstance(side, int | float)]
+        if elements is not None and sides and min(map(abs, sides)) < FARTHEST:  # beyond it, no longer the quantity
+            elements = [element.model_copy(update={"offset": None}) for element in elements]
         yield name if elements is None else scaled(elements, term.get("scale"))
 
 
@@ -146,12 +154,10 @@ def _term(
         default = JOINTS[kind][2]
         asset = below(parameters, "asset_cfg")
         robot = str(below(asset, "name") or "robot")
-        joints = robot_joints(file, robot, joint_order)
-        if joints is None:
+        known = robot_joints(file, env, robot, joint_order)
+        if known is None:
             return None
-        patterns = below(asset, "joint_names")
-        if patterns is not None:
-            joints = list(match([patterns] if isinstance(patterns, str) else patterns, joints, "joint_names"))
+        joints = _observed_joints(asset, known)
         offsets = [0.0] * len(joints)
         if default and below(below(below(env.get("scene"), robot), "init_state"), default) is not None:
             offsets = default_offset(env, {"asset_name": robot, "class_type": str(term["func"])}, default, joints)
@@ -159,7 +165,9 @@ def _term(
     if kind in BODY:
         return body_elements(name, kind, order)
     if kind == "last_action" and below(parameters, "action_name") is None and actions.elements:
-        return last_action(name, actions.elements)
+        affine = actions.affine if actions.processed else None
+        numbers = (affine.scale.tolist(), affine.offset.tolist()) if affine is not None else ()
+        return last_action(name, actions.elements, *numbers)
     if kind == "generated_commands":
         command = below(env.get("commands"), str(below(parameters, "command_name")))
         path = str(below(command, "class_type") or "")
@@ -172,11 +180,46 @@ def _term(
     return None
 
 
+def _observed_joints(asset: Any, robot: Sequence[str]) -> list[str]:
+    """Return the joints of a term in its order: SceneEntityCfg's `joint_names` or `joint_ids`. Raises ValueError."""
+    patterns = below(asset, "joint_names")
+    if patterns is None:
+        return selected(robot, below(asset, "joint_ids"))
+    found = match([patterns] if isinstance(patterns, str) else patterns, robot, "joint_names")
+    keeps = below(asset, "preserve_order") is True
+    return sorted(found, key=lambda joint: found[joint]) if keeps else list(found)
+
+
+def clip_notes(file: Path, groups: Sequence[str]) -> Iterator[str]:
+    """Yield a warning for each term of an observation that the training clips: no exported graph does."""
+    env = read_yaml(file) if file.is_file() else {}
+    for group in groups:
+        settings = below(below(env, "observations"), group)
+        terms = below(settings, "terms") or settings  # mjlab's
+        for name, term in terms.items() if isinstance(terms, Mapping) else ():
+            if note := clip_note(str(name), below(term, "clip")):
+                yield note
+
+
+def clip_note(name: str, clip: Any) -> str:
+    """Return a warning that an observation's term is clipped before it is scaled; '' if it is not."""
+    ends = [end for end in clip if isinstance(end, int | float)] if isinstance(clip, list | tuple) else []
+    if not np.isfinite(ends).any():
+        return ""
+    sides = " to ".join(f"{end:g}" for end in ends)
+    return f"the training clips '{name}' of the observation to {sides}, the export does not: clip it before you send it"
+
+
 def joint_elements(name: str, kind: str, joints: Sequence[str], offsets: Sequence[float | None]) -> list[Element]:
-    """Return the elements of a function of joints; an offset that is not known is None."""
+    """Return the elements of a function of joints.
+
+    A position whose offset is not known (None) may be relative to a default: it is not called a position.
+    """
     quantity, unit, _ = JOINTS[kind]
     return [
-        Element(name=f"{name}_{joint}", unit=unit, quantity=quantity, joint=joint, scale=1.0, offset=offset)
+        Element(name=f"{name}_{joint}", unit=unit, joint=joint)
+        if offset is None and quantity == "joint position"
+        else Element(name=f"{name}_{joint}", unit=unit, quantity=quantity, joint=joint, scale=1.0, offset=offset)
         for joint, offset in zip(joints, offsets, strict=True)
     ]
 
@@ -189,11 +232,21 @@ def body_elements(name: str, kind: str, order: str) -> list[Element]:
     return [Element(name=f"{name}_{axis}", unit=unit, quantity=quantity, axis=axis, frame=frame) for axis in axes]
 
 
-def last_action(name: str, actions: Sequence[Element]) -> list[Element]:
-    """Return the elements of the action before."""
+def last_action(
+    name: str, actions: Sequence[Element], scale: Sequence[float] = (), offset: Sequence[float] = ()
+) -> list[Element]:
+    """Return the elements of the action before, in the policy's own numbers: the action is these * scale + offset."""
+    unknown: list[float | None] = [None] * len(actions)
+    known = zip(actions, scale or unknown, offset or unknown, strict=True)
     return [
-        Element(name=f"{name}_{element.joint or index}", quantity="last action", joint=element.joint)
-        for index, element in enumerate(actions)
+        Element(
+            name=f"{name}_{action.joint or index}",
+            quantity="last action",
+            joint=action.joint,
+            scale=factor,
+            offset=shift,
+        )
+        for index, (action, factor, shift) in enumerate(known)
     ]
 
 

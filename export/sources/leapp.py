@@ -130,7 +130,7 @@ def _manager(file: Path) -> Any:
 
 
 def _ignore_deprecation() -> None:
-    warnings.filterwarnings("ignore", r"`torch\.jit\.\w+` is deprecated", DeprecationWarning)
+    warnings.filterwarnings("ignore", r"`torch\.jit\.\w+` is (deprecated|not supported)", DeprecationWarning)
 
 
 def _first_values(description: Description) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""LEAPP's YAML: stages, their tensors, the edges between them, and what a person should know of them."""
+"""LEAPP's YAML: stages, their tensors, the edges between them, and what a person should know about them."""
 
 from __future__ import annotations
 
@@ -122,8 +122,9 @@ def _described(file: Path, described: Mapping[str, Any]) -> Description:
     if not keys["inputs"] or not keys["outputs"]:
         none = "inputs" if not keys["inputs"] else "outputs"
         raise UnsupportedError(
-            f"{file} has no {none}: all its {none} are connected to stages, so there is nothing to observe or to "
-            "answer; LEAPP leaves out what is fed back, so give an action as an output of its own beside it"
+            f"{file} has no {none}: all its {none} are connected to stages, so the policy would have no "
+            f"{'observation' if none == 'inputs' else 'action'}; LEAPP leaves out what is fed back, so also return it "
+            "as an output of its own"
         )
     flows: dict[str, tuple[str, ...]] = {}
     for part in ("data_flow", "feedback_flow"):

@@ -113,6 +113,10 @@ def _reduction(function: Callable[[Tensor, list[int], bool], Tensor]) -> Callabl
 
 
 def _cast(a: Attributes, x: Tensor) -> Tensor:
+    if a["to"] in (onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16):
+        raise UnsupportedError(
+            "a graph that computes with half precision is not exported: its sums depend on the batch"
+        )
     return x.to(torch.from_numpy(np.zeros(0, helper.tensor_dtype_to_np_dtype(a["to"]))).dtype)
 
 
@@ -125,6 +129,20 @@ def _convolution(a: Attributes, x: Tensor, w: Tensor, b: Tensor | None = None) -
     strides, dilations = (list(a.get(name, [1] * axes)) for name in ("strides", "dilations"))
     result: Tensor = convolve(x, w, b, strides, pads[:axes], dilations, a.get("group", 1))
     return result
+
+
+def _dropout(_: Attributes, x: Tensor, ratio: Any = None, training: Any = None) -> Tensor:  # noqa: ARG001
+    if training is not None and bool(training.any()):
+        raise UnsupportedError("a Dropout in training mode is not exported")
+    return x
+
+
+def _batch_normalization(
+    a: Attributes, x: Tensor, scale: Tensor, bias: Tensor, mean: Tensor, variance: Tensor
+) -> Tensor:
+    if a.get("training_mode"):
+        raise UnsupportedError("a BatchNormalization in training mode is not exported")
+    return functional.batch_norm(x, mean, variance, scale, bias, eps=a.get("epsilon", 1e-5))
 
 
 PLAIN: dict[str, Callable[..., Tensor]] = {
@@ -146,6 +164,8 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "Gemm": _gemm,
     "Conv": _convolution,
     "Clip": _clip,
+    "Dropout": _dropout,
+    "BatchNormalization": _batch_normalization,
     "Min": lambda _, *parts: reduce(torch.minimum, parts),
     "Max": lambda _, *parts: reduce(torch.maximum, parts),
     "Sum": lambda _, *parts: reduce(torch.add, parts),

@@ -6,7 +6,7 @@ import contextlib
 import io
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,8 @@ import yaml
 from gymnasium.spaces import Box
 
 from rlservo.errors import CheckpointError, UnsupportedError
-from rlservo.export.checkpoints.facts import CheckpointFacts
+from rlservo.export.checkpoints.facts import CheckpointFacts, read_facts
+from rlservo.export.checkpoints.location import FACTS_FILE
 from rlservo.export.checkpoints.unpickle import explain
 from rlservo.export.recipe.recipe import ObservationFilter, Recipe, StateLeaf
 from rlservo.export.sources.source import Notify, PolicyFiles, RestoreOptions, Source, one_policy
@@ -66,7 +67,9 @@ class RslRl(Source):
     def loads(self, files: PolicyFiles) -> str:  # noqa: ARG002
         return ""  # torch.load(weights_only=True) and plain YAML
 
-    def facts(self, files: PolicyFiles, notify: Notify) -> CheckpointFacts:  # noqa: ARG002
+    def facts(self, files: PolicyFiles, notify: Notify) -> CheckpointFacts:
+        if (files.root.parent / FACTS_FILE).is_file():  # one of the policies that ship
+            return read_facts(files.root.parent, notify)
         from rlservo.export.sources.isaac_env import read_yaml, section
 
         agent_file = _agent_file(files.root) or files.root
@@ -128,7 +131,8 @@ def _why_not_weights(error: Exception) -> str:
 
 def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> RestoredPolicy:
     from rlservo.export.sources.isaac_env import action_terms, clip_actions, read_yaml
-    from rlservo.export.sources.isaac_observations import observation_elements
+    from rlservo.export.sources.isaac_observations import clip_notes, observation_elements
+    from rlservo.export.sources.present_position import with_targets
     from rlservo.export.sources.restored_policy import ElementNames
     from rlservo.export.sources.torch_policy import TorchPolicy, restored
 
@@ -143,7 +147,7 @@ def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> Restor
     groups = _groups(agent_file, agent, part)
     if len(groups) > 1:
         notify(f"an observation concatenates the groups {', '.join(groups)}, in this order")
-    for note in terms.notes:
+    for note in (*terms.notes, *clip_notes(environment, groups)):
         notify(note)
     frozen = _filter(file, actor)
     memory = _memory(actor)
@@ -158,6 +162,8 @@ def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> Restor
         memory,
         affine=terms.affine,
     )
+    observed = observation_elements(environment, groups, actor.obs_dim, terms, joint_order)
+    recipe, elements = with_targets(recipe, ElementNames(observed, terms.elements, terms.control_rate_hz))
     exported = actor.as_onnx(verbose=False)
     if frozen is not None:
         import torch
@@ -167,11 +173,10 @@ def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> Restor
         f"the normalizer's statistics come from {frozen.count} observations" if frozen and not frozen.count else ""
     )
     reference = _RslRlReference(
-        file, part, (actor.obs_dim, size), environment if terms.processed else None, joint_order
-    )
+        file, part, (actor.obs_dim, size), environment if terms.processed else None, joint_order,
+        groups if recipe.present else (),
+    )  # fmt: skip
     policy = TorchPolicy(recipe, exported, _traced(len(memory)), lambda: reference)
-    observed = observation_elements(environment, groups, actor.obs_dim, terms, joint_order)
-    elements = ElementNames(observed, terms.elements, terms.control_rate_hz)
     return restored(policy, elements, str(file), _name(actor), untrained)
 
 
@@ -290,8 +295,15 @@ class _RslRlReference:
     """
 
     def __init__(
-        self, file: Path, part: str, sizes: tuple[int, int], environment: Path | None, joint_order: tuple[str, ...]
+        self,
+        file: Path,
+        part: str,
+        sizes: tuple[int, int],
+        environment: Path | None,
+        joint_order: tuple[str, ...],
+        positions_in: Sequence[str],
     ) -> None:
+        """`positions_in` are the observation's groups if a relative action is added to the positions in them."""
         from rlservo.export.sources.isaac_actions import process_actions
 
         try:
@@ -310,7 +322,7 @@ class _RslRlReference:
             )
         if self._policy.is_recurrent:
             self._check_begin(file, sizes[0])
-        self._process = process_actions(environment, joint_order, settings.get("clip_actions"))
+        self._process = process_actions(environment, joint_order, settings.get("clip_actions"), positions_in)
 
     def __call__(self, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
         if state:
@@ -318,7 +330,7 @@ class _RslRlReference:
             self._policy.reset(hidden_state=tuple(hidden) if len(hidden) > 1 else hidden[0])
         action = self._policy(self._observed(obs))
         after = self._memory() if state else []
-        return self._process(action), [leaf.transpose(0, 1) for leaf in after]
+        return self._process(action, obs), [leaf.transpose(0, 1) for leaf in after]
 
     def _memory(self) -> list[Tensor]:
         hidden = self._policy.get_hidden_state()

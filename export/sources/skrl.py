@@ -10,7 +10,7 @@ import contextlib
 import io
 import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -101,7 +101,8 @@ def find_run(path: Path) -> tuple[Path, Path] | None:
 
 def _restore(file: Path, agent_file: Path, joint_order: tuple[str, ...], notify: Notify) -> RestoredPolicy:
     from rlservo.export.sources.isaac_env import ActionTerms, action_terms, read_yaml
-    from rlservo.export.sources.isaac_observations import observation_elements
+    from rlservo.export.sources.isaac_observations import clip_notes, observation_elements
+    from rlservo.export.sources.present_position import with_targets
     from rlservo.export.sources.restored_policy import ElementNames
     from rlservo.export.sources.torch_policy import TorchPolicy, restored
 
@@ -113,7 +114,7 @@ def _restore(file: Path, agent_file: Path, joint_order: tuple[str, ...], notify:
     terms = ActionTerms()
     if layout.choices is None:
         terms = action_terms(environment, layout.actions, None, joint_order)
-    for note in terms.notes:
+    for note in (*terms.notes, *clip_notes(environment, ("policy",))):
         notify(note)
     best = file.with_name("best_agent.pt")
     if _AGENT.fullmatch(file.name) and best.is_file():
@@ -134,17 +135,21 @@ def _restore(file: Path, agent_file: Path, joint_order: tuple[str, ...], notify:
         "categorical" if layout.choices in ("log_probabilities", "probabilities") else None,
         affine=terms.affine,
     )
+    observed = observation_elements(environment, ("policy",), layout.observed, terms, joint_order)
+    recipe, elements = with_targets(recipe, ElementNames(observed, terms.elements, terms.control_rate_hz))
 
     def act(policy: Any, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
         output = policy.compute({"observations": obs, "states": None}, layout.role)[0]
         return _scores(output, layout.choices), state
 
-    reference = _SkrlReference(file, agent_file, layout, environment if terms.processed else None, joint_order)
+    reference = _SkrlReference(
+        file, agent_file, layout, environment if terms.processed else None, joint_order,
+        ("policy",) if recipe.present else (),
+    )  # fmt: skip
     untrained = f"the scaler's statistics come from {frozen.count} observation" if frozen and frozen.count <= 1 else ""
     names = {None: (), "q_values": (Q_VALUES,)}.get(layout.choices, (ACTION_DIST_INPUTS,))
     traced = TorchPolicy(recipe, agent.models[layout.role], act, lambda: reference, names)
-    observed = observation_elements(environment, ("policy",), layout.observed, terms, joint_order)
-    return restored(traced, ElementNames(observed, terms.elements, terms.control_rate_hz), str(file), "", untrained)
+    return restored(traced, elements, str(file), "", untrained)
 
 
 def _scores(output: Tensor, choices: str | None) -> Tensor:
@@ -166,7 +171,13 @@ class _SkrlReference:
     """
 
     def __init__(
-        self, file: Path, agent_file: Path, layout: _Layout, environment: Path | None, joint_order: tuple[str, ...]
+        self,
+        file: Path,
+        agent_file: Path,
+        layout: _Layout,
+        environment: Path | None,
+        joint_order: tuple[str, ...],
+        positions_in: Sequence[str],
     ) -> None:
         from skrl.utils.runner.torch import Runner
 
@@ -179,14 +190,14 @@ class _SkrlReference:
         config["agent"] = {name: value for name, value in config["agent"].items() if not _explores(name)}
         self._agent = _agent(file, config, layout)
         self._role, self._choices, self._states = layout.role, layout.choices, layout.states
-        self._process = process_actions(environment, joint_order, None)
+        self._process = process_actions(environment, joint_order, None, positions_in)
 
     def __call__(self, obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
         # A value function may take states, whatever they are.
         states = obs.new_zeros((len(obs), self._states)) if self._states else None
         actions, outputs = self._agent.act(obs, states, timestep=0, timesteps=1)
         if self._choices is None:
-            return self._process(outputs.get("mean_actions", actions)), state
+            return self._process(outputs.get("mean_actions", actions), obs), state
         model = self._agent.models[self._role]
         if self._choices != "q_values":
             return model.distribution(role=self._role).logits, state
@@ -225,6 +236,11 @@ def _layout(file: Path, agent_file: Path, config: Mapping[str, Any], weights: Ma
         raise UnsupportedError(
             f"{file} is of a recurrent agent ({algorithm}), and agent.yaml does not describe its models: make the "
             "agent in Python and export it with rlservo.export_policy, as examples/skrl_recurrent.py does"
+        )
+    if algorithm.lower() in ("ippo", "mappo"):
+        raise UnsupportedError(
+            f"{file} is of several agents ({algorithm}: {', '.join(sorted(map(str, weights)))}): give the policy of "
+            "each, with its preprocessor, to rlservo.export_policy"
         )
     role = next((role for role in ("policy", "q_network") if isinstance(weights.get(role), Mapping)), None)
     if role is None:

@@ -149,5 +149,5 @@ def one_policy(path: Path, files: Sequence[Path], module_id: str | None, agent_i
     """Return the only policy of a checkpoint. Raises CheckpointError when another is requested."""
     policy = SinglePolicy(path, tuple(files))
     if module_id not in (None, policy.module_id) or agent_id is not None:
-        raise CheckpointError(f"{path} holds one policy: leave --module-id and --agent-id out")
+        raise CheckpointError(f"{path}: --module-id and --agent-id are RLlib's: leave them out")
     return policy

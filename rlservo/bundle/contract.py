@@ -148,7 +148,7 @@ class Evaluation(FrozenModel):
     )
     endings: dict[str, int] = Field(default_factory=dict, description="Number of episodes by ending")
     robot: dict[str, Any] = Field(
-        default_factory=dict, description="Robot that was simulated: model, control rate, share of its velocities"
+        default_factory=dict, description="Robot that was simulated: model, control rate, share of its velocity limits"
     )
     evaluated_at: str
 
@@ -189,7 +189,7 @@ def first_fault(error: ValidationError, *, shows_input: bool = False) -> str:
     """Return the first error in a document: `field: message`, and the input."""
     first = error.errors(include_url=False)[0]
     given = f" (given: {first['input']!r:.80})" if shows_input else ""
-    reason = first["msg"]
+    reason = first["msg"].removeprefix("Value error, ")  # pydantic's, before our own sentence
     if (pattern := first.get("ctx", {}).get("pattern")) in PATTERNS:
         reason = f"expected {PATTERNS[pattern]}"
     return f"{'.'.join(str(part)[:80] for part in first['loc']) or 'the document'}: {reason}{given}"

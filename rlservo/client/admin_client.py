@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from rlservo.client.formats.addresses import is_loopback
 from rlservo.client.formats.admin_key_file import key_file, read_key
 from rlservo.client.http_transport import Transport
-from rlservo.errors import RlservoError, UnavailableError, UsageError
+from rlservo.errors import RlservoError, UnauthenticatedError, UnavailableError, UsageError
 from rlservo.policy.acting_policy import Closeable
 
 KEY_VARIABLE = "RLSERVO_ADMIN_KEY"
@@ -25,7 +25,14 @@ class AdminClient(Closeable):
     def __init__(self, url: str, *, api_key: str, timeout_s: float = TIMEOUT_S) -> None:
         """Take the connection's settings; nothing is sent before the first call."""
         # Not retried: a change whose answer was lost would be made twice.
-        self._transport = Transport(url, timeout_s=timeout_s, retries=0, api_key=api_key)
+        self._transport = _Transport(url, timeout_s=timeout_s, retries=0, api_key=api_key)
+
+    @classmethod
+    def of_operator(cls, url: str, file: Path | None) -> AdminClient:
+        """Return a client with the key that `find_key` finds, whose errors say where that is. Raises what it raises."""
+        client = cls(url, api_key=find_key(url, file))
+        client._transport.key_place = str(file or f"{KEY_VARIABLE}, or in the file that 'rlservo serve' wrote here")
+        return client
 
     def listing(self) -> dict[str, Any]:
         """Return the answering process's listing, as `GET /v1/policies`."""
@@ -87,6 +94,22 @@ class AdminClient(Closeable):
         """Send a command (`load`, `unload`, `alias`, `rollback`, `canary`, `shadow`); return the new listing."""
         reply: dict[str, Any] = self._transport.post("v1", "admin", "policies", name, command, document=document)
         return reply
+
+
+class _Transport(Transport):
+    """A transport that says where a key came from which the server does not know."""
+
+    key_place = ""
+
+    def _call(self, method: str, path: tuple[str, ...], body: bytes | None, timeout_s: float | None) -> bytes:
+        try:
+            return super()._call(method, path, body, timeout_s)
+        except UnauthenticatedError:
+            if not self.key_place:
+                raise
+            raise UnauthenticatedError(
+                f"{self.url} does not know the key in {self.key_place}: expected one of that server's keys"
+            ) from None
 
 
 def find_key(url: str, file: Path | None) -> str:

@@ -151,9 +151,9 @@ class Promotion:
         """Check the server's plan, and count from here on. Raises RlservoError."""
         name, version, policy = self.terms.policy, self.terms.version, self._served()
         if version not in (versions := policy.get("versions", ())):
+            wrong = f"has no version {version}: expected one of {', '.join(versions)}" if versions else "is not served"
             raise UsageError(
-                f"policy '{name}' has no version {version}: expected one of {', '.join(versions) or 'none'}; 'rlservo "
-                f"policy load {name} {version}' loads one from the server's repository"
+                f"policy '{name}' {wrong}; 'rlservo policy load {name} {version}' loads it from the server's repository"
             )
         if policy["version"] == version:
             raise UsageError(f"version {version} of policy '{name}' is already in production")

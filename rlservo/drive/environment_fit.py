@@ -70,8 +70,8 @@ def check_complete(contract: Contract, side: str, ours: Sequence[Element], their
     if what:
         say = f" or with --convention {option}=..." if option else ""
         raise UsageError(
-            f"policy {contract.name!r} does not say of its {side} {what}: export it again, with --env and an "
-            f"environment whose describe() says it{say}"
+            f"policy {contract.name!r}: its {side} does not state {what}: export it again, with --env and an "
+            f"environment whose describe() states it{say}"
         )
 
 

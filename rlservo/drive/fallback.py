@@ -187,7 +187,7 @@ def _zero(contract: Contract) -> Any:
     choice = next((name for name, leaf in leaves.items() if np.dtype(leaf.dtype).kind != "f"), None)
     if choice is not None:
         raise UsageError(
-            f"{choice} of policy '{contract.name}' is a choice, and zero is one of the choices: give an action"
+            f"{choice} of policy '{contract.name}' is discrete, and 0 is one of its choices, not a stop: give an action"
         )
     zeros = {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in leaves.items()}
     return _parse_action(contract, build_action(contract.action_space, zeros))

@@ -25,7 +25,7 @@ from rlservo.bundle.spaces import leaf_specs
 from rlservo.errors import ActionError, RequestError, UsageError
 from rlservo.policy.acting_policy import Closeable, Observation
 from rlservo.policy.action_check import ActionCheck
-from rlservo.policy.action_rate_limit import StepLimit
+from rlservo.policy.action_step_limit import StepLimit
 from rlservo.policy.drift import Drift
 from rlservo.policy.exploration import Draw, draw_action
 from rlservo.policy.loading import (
@@ -39,7 +39,7 @@ from rlservo.policy.loading import (
     leaves_value_out,
     open_graph,
 )
-from rlservo.policy.observation_check import ObservationParser, Observed
+from rlservo.policy.observation_parser import ObservationParser, Observed
 from rlservo.policy.options import DEFAULT_OPTIONS, PolicyOptions
 from rlservo.policy.recurrent_state import State, StateTensors
 

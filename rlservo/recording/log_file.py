@@ -59,6 +59,7 @@ class LogFile:
                 "rlservo": rlservo.__version__,
             }
             self._writer.add_metadata("rlservo", started)
+            self.flush()  # from now on it is an MCAP file to every reader
         except BaseException:
             self.abandon()
             raise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import platform
+import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -52,3 +54,15 @@ def host_of(robot: str) -> str | None:
 
 def mode_name(mode: int) -> str:
     return STARTUP_MODES[mode] if 0 <= mode < len(STARTUP_MODES) else f"robot mode {mode}"
+
+
+def no_driver() -> str:
+    """Return that ur-rtde is missing, and how to get it here."""
+    how = "pip install '.[ur]' in the checkout of rlservo"
+    here = f"Python {sys.version_info[0]}.{sys.version_info[1]} on {platform.machine()}"
+    if here not in ("Python 3.11 on x86_64", "Python 3.12 on x86_64"):
+        how = (
+            f"ur-rtde has wheels for Python 3.11 and 3.12 on x86_64, and this is {here}: use one of these, compile it, "
+            "or drive the arm through ROS 2 (robot=ros2:)"
+        )
+    return f"a real robot needs the Python package 'rtde_control': {how}"

@@ -55,6 +55,7 @@ class ArmDriver(Protocol):
     rate_hz: float  # of setpoints
     following: FollowingBound  # of the newest reading's targets
     hint: str  # what to look at when the arm does not follow
+    frames: Vector | None  # of its own kinematics (calibration.py); None if they are the data sheet's, for all it tells
 
     def read(self) -> ArmReading: ...  # the newest state
     def silence(self) -> str: ...  # why no new state comes, as a fault

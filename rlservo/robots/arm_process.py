@@ -76,6 +76,12 @@ class ArmProcess:
         """The command stream's process id."""
         return self._process.pid
 
+    @property
+    def frames(self) -> Vector | None:
+        """The arm's own kinematics, as in calibration.py; None if it does not tell them."""
+        frames: Vector = self._report.read()["frames"]
+        return frames if frames.any() else None
+
     def arm_state(self) -> ArmState:
         """Return the newest state."""
         report = self._report.read()

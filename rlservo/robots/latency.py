@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -68,11 +69,18 @@ class LatencyReport:
     latencies: Histogram
     periods: Histogram  # of the command stream: between two setpoints
     is_realtime: bool  # the kernel has PREEMPT_RT
+    fault: str  # which ended the measurement early; empty if none did
 
     @property
     def disturbance(self) -> str:
         """Argument of `rlservo verify --disturb`: the worst latency in whole cycles, and a real sensor's noise."""
         return f"latency={self.cycles},noise=real"
+
+
+class _Measured(NamedTuple):
+    latencies_s: list[float]
+    periods_s: list[float]  # between two states of the robot
+    still: list[Vector]  # positions at rest
 
 
 def measure_latency(
@@ -93,12 +101,43 @@ def measure_latency(
     is_full = arm.scale >= FULL
     if not is_full and arm.host.startswith(ROS2):
         raise RobotError(f"the speed scaling is {arm.scale:.0%}: set the slider to 100% for this measurement")
+    measured, fault = _Measured([], [], []), ""
+    try:
+        _turn(arm, measured, steps, time.monotonic() + 3600 * hours, on_step, is_full=is_full)
+    except RobotError as error:
+        if len(measured.latencies_s) < steps:
+            raise
+        fault = str(error)  # what was measured for hours is told all the same
+    latencies_s, periods_s, still = measured
+    counts, longest_s = arm.periods()
+    p5, p50, p95 = (1e3 * float(value) for value in np.percentile(latencies_s, (5, 50, 95)))
+    worst = 1e3 * max(latencies_s)
+    motions = np.bincount([int(1e3 * latency_s) for latency_s in latencies_s]).astype(np.float64)
+    return LatencyReport(
+        steps=len(latencies_s),
+        p50_ms=p50,
+        p95_ms=p95,
+        max_ms=worst,
+        jitter_ms=p95 - p5,
+        state_period_ms=1e3 * float(np.median(periods_s)) if periods_s else math.nan,
+        noise=float(np.std([one[:JOINT] for one in still], axis=0).max()),
+        control_rate_hz=control_rate_hz,
+        cycles=max(1, math.ceil(worst / 1e3 * control_rate_hz)),
+        latencies=Histogram.of(motions, 1.0, worst),
+        periods=Histogram.of(counts, 1e3 * PERIOD_S, 1e3 * longest_s),
+        is_realtime=REALTIME.is_file() and REALTIME.read_text().strip() == "1",
+        fault=fault,
+    )
+
+
+def _turn(
+    arm: ArmProcess, measured: _Measured, steps: int, end_s: float, on_step: Callable[[int], None], *, is_full: bool
+) -> None:
+    """Turn the wrist back and forth, and append what is measured."""
     lag_s = 0.0 if is_full else arm.limits.lookahead_s / 2.0
     home = arm.arm_state().positions.copy()
-    latencies_s: list[float] = []
-    periods_s: list[float] = []
-    still: list[Vector] = []
-    end_s, missed = time.monotonic() + 3600 * hours, 0
+    latencies_s, periods_s, still = measured
+    missed = 0
     while len(latencies_s) < steps or time.monotonic() < end_s:
         if missed >= 2 * max(steps, len(latencies_s)):
             arm.go_to(home)
@@ -123,24 +162,6 @@ def measure_latency(
             arm.command(goal, max(began + STEP_S - time.monotonic(), AGAIN_S))
             time.sleep(AGAIN_S)
     arm.go_to(home)
-    counts, longest_s = arm.periods()
-    p5, p50, p95 = (1e3 * float(value) for value in np.percentile(latencies_s, (5, 50, 95)))
-    worst = 1e3 * max(latencies_s)
-    motions = np.bincount([int(1e3 * latency_s) for latency_s in latencies_s]).astype(np.float64)
-    return LatencyReport(
-        steps=len(latencies_s),
-        p50_ms=p50,
-        p95_ms=p95,
-        max_ms=worst,
-        jitter_ms=p95 - p5,
-        state_period_ms=1e3 * float(np.median(periods_s)) if periods_s else math.nan,
-        noise=float(np.std([one[:JOINT] for one in still], axis=0).max()),
-        control_rate_hz=control_rate_hz,
-        cycles=max(1, math.ceil(worst / 1e3 * control_rate_hz)),
-        latencies=Histogram.of(motions, 1.0, worst),
-        periods=Histogram.of(counts, 1e3 * PERIOD_S, 1e3 * longest_s),
-        is_realtime=REALTIME.is_file() and REALTIME.read_text().strip() == "1",
-    )
 
 
 def _wait_for_rest(arm: ArmProcess, *, is_full: bool) -> Vector | None:

@@ -148,7 +148,7 @@ class MotionLimiter:
         for joint, at, low, high in zip(JOINTS, self.position, self._low, self._high, strict=True):
             if not low <= at <= high:
                 within = f"outside its limits of {low:.3g} to {high:.3g} rad"
-                raise RobotError(f"{joint} is at {at:.3g} rad, {within}: lead it inside by hand, or widen them")
+                raise RobotError(f"{joint} is at {at:.3g} rad, {within}: move it inside by hand, or widen the limits")
 
     def goal_within(self, goal: Vector) -> Vector:
         """Return the goal within the position limits, and note the joints that were outside."""

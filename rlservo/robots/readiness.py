@@ -1,15 +1,14 @@
-"""Readiness of a real robot: what its controller tells, and what keeps it from being driven. Nothing is commanded."""
+"""Readiness of a real robot: what its controller reports, and what prevents driving it. Nothing is commanded."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlservo.robots.arm_interface import (
     ROS2,
@@ -19,6 +18,7 @@ from rlservo.robots.arm_interface import (
     SAFE_MODES,
     STOP_NAMES,
     RobotError,
+    Vector,
     host_of,
     mode_name,
 )
@@ -26,6 +26,7 @@ from rlservo.robots.arm_port import ZERO_SCALE, ArmReading, ServoSettings
 from rlservo.robots.limits import Limits, MotionLimiter
 from rlservo.robots.rtde_driver import VARIABLES, reading_of
 from rlservo.robots.rtde_probe import no_answer, round_trip_s
+from rlservo.robots.ur.calibration import MOST, deviation_m, frames_of, read_calibration, too_far
 from rlservo.robots.ur.parameters import UR_PARAMETERS, model_of, rate_hz_of
 from rlservo.robots.ur.simulation import URSimulation
 
@@ -40,7 +41,7 @@ class Finding(NamedTuple):
     what: str
     found: str
     problem: str = ""  # why it must not be driven, and what to do
-    numbers: tuple[float, ...] = ()
+    numbers: Sequence[Any] = ()
 
 
 def look_at(robot: str, ur_model: str | None, limits: Mapping[str, Any]) -> tuple[str, list[Finding]]:
@@ -60,20 +61,30 @@ def look_at(robot: str, ur_model: str | None, limits: Mapping[str, Any]) -> tupl
         with closing(RosArmConnection(ServoSettings(host, model, 0.1, 0.25, checked, 0, 0))) as driver:
             return model, [
                 Finding("model", f"{model} ({'given' if ur_model else 'assumed: give --ur-model'})", _unknown(model)),
+                Finding("calibration", "not read through ROS 2: kinematics are the data sheet's"),
                 *_state(driver.read, model, checked),
             ]
     model, findings = _dashboard(host, ur_model)
-    return model, [*findings, *_over_rtde(host, model, checked)]
+    calibration = _calibration(host, model)
+    return model, [*findings, calibration, *_over_rtde(host, model, checked, calibration.numbers)]
 
 
-def present_state(host: str, ur_model: str, limits: Limits) -> tuple[NDArray[np.float64], float]:
-    """Return an arm's joint positions [rad] (6,) and its speed scaling. Raises RobotError if it may not be driven."""
+def present_state(host: str, ur_model: str, limits: Limits) -> tuple[Vector, float, Vector | None]:
+    """Return an arm's joint positions [rad] (6,), its speed scaling and the frames of its kinematics, if it tells them.
+
+    Raises RobotError if it may not be driven.
+    """
     _, findings = look_at(host if host.startswith(ROS2) else f"{RTDE}{host}", ur_model, dataclasses.asdict(limits))
     found = {one.what: one for one in findings}
     problems = [one for one in findings if one.problem and not (one.what == "states" and "joints" in found)]
     if problems:
         raise RobotError("; ".join(f"{one.what}: {one.found}: {one.problem}" for one in problems))
-    return np.array(found["joints"].numbers), found["speed slider"].numbers[0]
+    own = found["calibration"].numbers
+    return (
+        np.array(found["joints"].numbers),
+        found["speed slider"].numbers[0],
+        frames_of(np.array(own)) if own else None,
+    )
 
 
 def _dashboard(host: str, ur_model: str | None) -> tuple[str, list[Finding]]:
@@ -103,7 +114,6 @@ def _dashboard(host: str, ur_model: str | None) -> tuple[str, list[Finding]]:
             ("on" if is_remote else "off (local)") if is_e_series else "CB3 has none",
             "" if is_remote else "enable remote control on the pendant (local, top right)",
         ),
-        Finding("calibration", "not read: kinematics are the data sheet's"),
         Finding("round trip", f"{1e3 * round_trip_s(host):.1f} ms"),
     ]
 
@@ -114,7 +124,20 @@ def _unknown(model: str) -> str:
     return f"its kinematics are unknown here: expected one of {', '.join(UR_PARAMETERS)}"
 
 
-def _over_rtde(host: str, model: str, limits: Limits) -> list[Finding]:
+def _calibration(host: str, model: str) -> Finding:
+    try:
+        parameters, state = read_calibration(host)
+    except RobotError as error:
+        return Finding("calibration", "none", str(error))
+    if model not in UR_PARAMETERS:
+        return Finding("calibration", state)
+    frames = frames_of(parameters)
+    off = deviation_m(model, frames)
+    found = f"{state}: the flange is up to {1e3 * off:.1f} mm from the data sheet's"
+    return Finding("calibration", found, too_far(off, model) if off > MOST else "", parameters.tolist())
+
+
+def _over_rtde(host: str, model: str, limits: Limits, own: Sequence[Any]) -> list[Finding]:
     import rtde_receive
 
     rate_hz = limits.rate_hz or rate_hz_of(model)
@@ -127,12 +150,12 @@ def _over_rtde(host: str, model: str, limits: Limits) -> list[Finding]:
         if reading_of(receive).is_program_running:
             program = Finding("program", "runs", "a program runs, and would be ended: end it on the pendant")
         slider = receive.getTargetSpeedFraction
-        return [*_state(lambda: reading_of(receive)._replace(scaling=slider()), model, limits), program]
+        return [*_state(lambda: reading_of(receive)._replace(scaling=slider()), model, limits, own), program]
     finally:
         receive.disconnect()
 
 
-def _state(read: Callable[[], ArmReading], model: str, limits: Limits) -> list[Finding]:
+def _state(read: Callable[[], ArmReading], model: str, limits: Limits, own: Sequence[Any] = ()) -> list[Finding]:
     """Return what a second of states says."""
     times_s, arrivals_s, began = [0.0], [0.0], time.monotonic()
     while (now := time.monotonic()) < began + (WATCHED_S if len(times_s) > 1 else FIRST_STATE_S):
@@ -162,22 +185,25 @@ def _state(read: Callable[[], ArmReading], model: str, limits: Limits) -> list[F
         ),
         Finding("safety mode", safe, "" if safety in SAFE_MODES else "find the cause, then unlock it on the pendant"),
         Finding("speed slider", f"{slider:.0%}", "" if slider >= ZERO_SCALE else "raise it on the pendant", (slider,)),
-        *_joints(reading.positions, model, limits),
+        *_joints(reading.positions, model, limits, own),
     ]
 
 
-def _joints(joints: NDArray[np.float64], model: str, limits: Limits) -> list[Finding]:
+def _joints(joints: Vector, model: str, limits: Limits, own: Sequence[Any]) -> list[Finding]:
     listed = ", ".join(f"{joint:z.2f}" for joint in joints)
     if model not in UR_PARAMETERS:
         return [Finding("joints", f"{listed} rad", "", tuple(joints.tolist()))]
-    limiter = MotionLimiter(limits, URSimulation(model, objects=()), np.ones(6), 0.01)
+    simulation = URSimulation(model, objects=())
+    if own:
+        simulation.calibrate(frames_of(np.array(own)))
+    limiter = MotionLimiter(limits, simulation, np.ones(6), 0.01)
     limiter.restart(joints.tolist())
     problem = ""
     try:
         limiter.check_start()
     except RobotError as error:
         problem = str(error)
-    flange = ", ".join(f"{value:z.2f}" for value in limiter.simulation.tool_at(joints)[0])
+    flange = ", ".join(f"{value:z.2f}" for value in simulation.tool_at(joints)[0])
     return [
         Finding("joints", f"{listed} rad", problem, tuple(joints.tolist())),
         Finding("flange", f"{flange} m in base_link"),

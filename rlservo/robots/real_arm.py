@@ -11,9 +11,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rlservo.robots.argument_checks import InvalidResetError
 from rlservo.robots.arm_interface import ArmState, RobotError
 from rlservo.robots.arm_states import ControlState
-from rlservo.robots.checks import InvalidResetError
 from rlservo.robots.limits import WALL_MARGIN, Limits
 from rlservo.robots.operator_terminal import Operator
 from rlservo.robots.real_robot import CommandedRobot, RealRobot
@@ -39,6 +39,8 @@ class CommandedArm(CommandedRobot, Protocol):
 
     @property
     def scale(self) -> float: ...
+    @property
+    def frames(self) -> Vector | None: ...
     def arm_state(self) -> ArmState: ...
     def setpoint(self) -> Vector: ...
     def command(self, joint_positions: ArrayLike, duration_s: float) -> None: ...
@@ -64,6 +66,8 @@ class RealArm(RealRobot[CommandedArm, ArmState]):
         """
         super().__init__(connect, operator, cycle_s=simulation.cycle_s, age_bound_s=AGE_BOUND_S)
         self.simulation, self._aim = simulation, aim
+        if self._robot.frames is not None:
+            simulation.calibrate(self._robot.frames)
         self._confirmed: list[tuple[Vector, str]] = []  # starts and targets that the operator has agreed to
         self._metrics: ArmMetrics | None = None
         if metrics is not None:

@@ -1,4 +1,4 @@
-"""A real arm that is looked at once and then rehearsed: the limits' own motion from its present pose, sending nothing.
+"""A real arm that is read once and then rehearsed: motion within the limits from its present pose; nothing is sent.
 
 The rehearsed arm follows each setpoint exactly, and its time passes as fast as it is computed.
 """
@@ -34,8 +34,10 @@ class RehearsedArm:
     def __init__(self, host: str, ur_model: str, *, velocity_scale: float, limits: Limits) -> None:
         """Read the arm's state. Raises RobotError if it cannot be reached, or is outside its limits."""
         self.host, self.limits = host, limits
-        positions, self.scale = present_state(host, ur_model, limits)
+        positions, self.scale, self.frames = present_state(host, ur_model, limits)
         simulation = URSimulation(ur_model, objects=())
+        if self.frames is not None:
+            simulation.calibrate(self.frames)
         velocities = np.array(simulation.parameters.velocity_limits)
         self._policy_velocities = velocities * velocity_scale * limits.speed_scale
         self._start_velocities = np.minimum(velocities, limits.start_speed) * limits.speed_scale

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from rlservo.robots.arm_interface import RUNNING, SAFE_MODES, STOP_NAMES, RobotError, Vector, mode_name
+from rlservo.robots.arm_interface import RUNNING, SAFE_MODES, STOP_NAMES, RobotError, Vector, mode_name, no_driver
 from rlservo.robots.arm_port import ZERO_SCALE, ArmReading, ServoSettings
 from rlservo.robots.following_error import FollowingBound
 from rlservo.robots.rtde_probe import no_answer
+from rlservo.robots.ur.calibration import own_frames
 from rlservo.robots.ur.parameters import CB3, UR_PARAMETERS, model_of, rate_hz_of
 
 FIRST_STATE_S = 5.0
@@ -36,8 +37,7 @@ class RtdeDriver:
             import rtde_control
             import rtde_receive
         except ImportError as error:
-            how = "pip install '.[ur]' in the checkout of rlservo"
-            raise RobotError(f"a real UR arm needs ur_rtde ({error}): {how}") from error
+            raise RobotError(no_driver()) from error
         self._control: Any = None
         host, limits = settings.host, settings.limits
         try:
@@ -48,6 +48,7 @@ class RtdeDriver:
             dashboard.disconnect()
         except RuntimeError as error:
             raise RobotError(no_answer(host, error)) from error
+        self.frames: Vector | None = own_frames(host, settings.ur_model)
         fastest = rate_hz_of(settings.ur_model)
         self.rate_hz = limits.rate_hz or fastest
         if self.rate_hz > fastest:

@@ -50,7 +50,7 @@ REPORT = np.dtype(
     [("phase", "f8"), ("received_s", "f8"), ("time_s", "f8"), ("age_s", "f8"), ("positions", "f8", 6),
      ("velocities", "f8", 6), ("robot_mode", "f8"), ("safety_mode", "f8"), ("setpoint", "f8", 6), ("blend", "f8"),
      ("scale", "f8"), ("target", "f8", 6), ("written_s", "f8"), ("limited", "f8", len(COUNTED)),
-     ("periods", "f8", PERIODS), ("longest_period_s", "f8")]
+     ("periods", "f8", PERIODS), ("longest_period_s", "f8"), ("frames", "f8", (7, 4, 4))]
 )  # fmt: skip
 
 
@@ -71,6 +71,9 @@ class ServoLoop:
         self._orders = SharedBlock(settings.orders_descriptor, ORDERS)
         self._report = SharedBlock(settings.report_descriptor, REPORT)
         self._dt = 1.0 / connection.rate_hz
+        if connection.frames is not None:
+            simulation.calibrate(connection.frames)
+            self._report.write({"frames": connection.frames})
         velocities = np.array(simulation.parameters.velocity_limits)
         self._policy_velocities = velocities * settings.velocity_scale * self._limits.speed_scale
         self._start_velocities = np.minimum(velocities, self._limits.start_speed) * self._limits.speed_scale

@@ -109,7 +109,7 @@ for _name in UNARY:
     # A line per request costs more than the policy; below this level Serve still formats it and drops it (5%).
     logging_config={"enable_access_log": False, "log_level": "WARNING"},
     health_check_period_s=1,  # a replica that hangs is replaced after three checks
-    health_check_timeout_s=2,
+    health_check_timeout_s=5,  # on a starved node an event loop may wait for seconds
     graceful_shutdown_timeout_s=15,
     user_config={},
     max_surge_percent=100,  # a rolling update starts the new replica before the old one stops
@@ -128,7 +128,7 @@ class PolicyServer(InferenceMethods):
             # Serve may have replaced `sys.stderr` by a logger that drops what is written there.
             with contextlib.redirect_stderr(sys.__stderr__):
                 configure(self._settings, replica=replica)
-            _log_deaths()
+            self._folder = _log_deaths()
             check_exposure(host, self._settings)
             self._control = plan_follower(places, self._settings)
             self._app = create_app(
@@ -145,6 +145,11 @@ class PolicyServer(InferenceMethods):
                 "%s=1 for `serve run`, or for `ray start` on every node",
                 *SWITCHES,
             )
+        if os.getpriority(os.PRIO_PROCESS, 0) > os.getpriority(os.PRIO_PROCESS, os.getppid()):
+            logger.warning(
+                "this replica gives way to all other programs of its machine, so answers may be late: set "
+                "RAY_worker_niceness=0 for `serve run`, or for `ray start` on every node"
+            )
 
     def __serve_build_asgi_app__(self) -> PolicyApp:  # Serve's hook: the app is built in the replica
         return self._app
@@ -158,7 +163,7 @@ class PolicyServer(InferenceMethods):
             self._reconfiguring = asyncio.create_task(self._configure(user_config))
             return
         try:
-            await self._running.enter_async_context(running(self._app.handler, user_config))
+            await self._running.enter_async_context(running(self._app.handler, user_config, self._folder))
         except RlservoError as error:
             raise _plain(error) from None
 
@@ -184,8 +189,11 @@ class PolicyServer(InferenceMethods):
             logger.exception("the configuration cannot be read; still serving the previous one")
 
 
-def _log_deaths() -> None:
-    """Log what replicas that died on this node were computing, and write down what this one computes."""
+def _log_deaths() -> Path:
+    """Log what replicas that died on this node were computing, and write down what this one computes.
+
+    Returns the folder of this node's replicas, which lives as long as Ray does.
+    """
     context = ray.get_runtime_context()
     folder = Path(context.get_temp_dir(), context.get_session_name(), "rlservo")
     folder.mkdir(exist_ok=True)
@@ -193,6 +201,7 @@ def _log_deaths() -> None:
         if computing:  # otherwise it may have been stopped
             logger.error("a replica (process %d) died while computing %s", pid, " and ".join(computing))
     write_to(folder)
+    return folder
 
 
 def add_service(_servicer: Any, server: Any) -> None:

@@ -9,10 +9,11 @@ import itertools
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rlservo.errors import RlservoError
-from rlservo.serve_app.server import current_keys, exposition, metrics
+from rlservo.serve_app.server import current_keys, metrics, sampled_metrics
 from rlservo.serve_app.server.request_handler import RequestHandler
 
 logger = logging.getLogger(__name__)
@@ -21,15 +22,15 @@ LOOK_S = 30.0  # [s] between looks for bundles that are not served
 
 
 @contextlib.asynccontextmanager
-async def running(handler: RequestHandler, served: Any) -> AsyncIterator[None]:
+async def running(handler: RequestHandler, served: Any, server_folder: Path | None = None) -> AsyncIterator[None]:
     """Load and prove the plan's versions or, without a plan, those of `served` (ServedConfig), and follow changes.
 
-    Raises UsageError, BundleError and UnavailableError.
+    `server_folder`: see `PlanFollower.configure`. Raises UsageError, BundleError and UnavailableError.
     """
     control, settings = handler.control, handler.settings
-    await control.configure(served)
+    await control.configure(served, server_folder)
     handler.admission.start_clock()
-    sample = partial(exposition.sample, handler) if handler.metrics.folder is not None else None
+    sample = partial(sampled_metrics.sample, handler) if handler.metrics.folder is not None else None
     if sample is not None:  # for the other workers to read
         await sample()
     background = [

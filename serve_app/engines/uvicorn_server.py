@@ -25,6 +25,7 @@ from typing import Any
 
 import uvicorn
 from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.config import STARTUP_FAILURE
 from uvicorn.supervisors import Multiprocess
 from uvicorn.supervisors.multiprocess import Process
 
@@ -48,14 +49,16 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import checked_start, not_served, plan_follower
 from rlservo.serve_app.versions.computing import left_by_dead, write_to
 from rlservo.serve_app.versions.deployment_plan import ServedConfig
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
 
 logger = logging.getLogger(__name__)
 
 KEEP_ALIVE_S = 90  # [s] that a connection may be idle
 DRAIN_S = 15  # [s] for requests in progress when the server stops
-HUNG_S = 30  # [s] until an unresponsive worker is replaced; a start on a busy machine takes as long
+HUNG_S = 30  # [s] until an unresponsive worker is replaced
+START_S = 300  # [s] until one that is starting is: on a starved machine the imports alone may take a minute
 PATIENCE_S = 10  # [s] until a start that takes longer is logged
+RETRY_S = 10  # [s] until a worker that could not start in place of another is started again
 EXIT_S = DRAIN_S + 5  # [s] for a worker to exit
 DESCRIPTORS = MAX_CONNECTIONS + 256  # open files that a server at full load needs
 FEWEST_DESCRIPTORS = 64  # with fewer no connection may be left
@@ -206,11 +209,12 @@ class EmbeddedServer:
             configure(settings, replica=replica)
             _stop_with_parent(self.admin_key_file, settings.operator_key)
             write_to(Path(os.environ[FOLDER_VARIABLE]))
+        server_folder = Path(os.environ[FOLDER_VARIABLE]) if is_worker else None
         control = plan_follower(self.places, settings)
         app = create_app(control, settings, replica=replica, host=self.host, is_alone=not is_worker)
         stack.callback(app.handler.metrics.leave)
         stack.push_async_callback(app.handler.close)
-        await stack.enter_async_context(running(app.handler, self.served))
+        await stack.enter_async_context(running(app.handler, self.served, server_folder))
         store = app.handler.store()
         if settings.default_policy not in (None, *store.names):
             raise UsageError(
@@ -325,6 +329,9 @@ class _Supervisor(Multiprocess):
         self._on_ready: Callable[[], None] | None = on_ready
         self._on_stop = on_stop
         self.is_asked_to_stop = False
+        self._computing: dict[int, list[str]] = {}  # versions that dead workers were computing
+        self._first_seen: dict[int | None, float] = {}  # by `time.monotonic`, of workers that are starting
+        self._retry_at: dict[int | None, float] = {}  # by `time.monotonic`, of workers that could not start
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._queue_stop)
 
@@ -338,21 +345,54 @@ class _Supervisor(Multiprocess):
             raise
 
     def keep_subprocess_alive(self) -> None:
-        """Replace workers that died or hang; report once when all are ready."""
+        """Replace workers that died or hang; report once when all are ready.
+
+        uvicorn's own method stops all workers if a new one cannot start. Here those that serve keep serving: a bundle
+        may have been exchanged since they started, or a file system be out of reach.
+        """
         for process in self.processes:
             process.child_conn.close()  # the worker has its own: if it dies in a health check, the wait for it ends
-        before = [(process, process.exitcode) for process in self.processes]
-        began = time.monotonic()
-        super().keep_subprocess_alive()
-        has_waited = time.monotonic() - began >= HUNG_S  # a worker may also die while it is asked
-        left = left_by_dead(Path(os.environ[FOLDER_VARIABLE]))
-        for process, code in before:
-            if process not in self.processes and process.pid is not None:
-                was_hung = has_waited and code is None and process.exitcode == -signal.SIGKILL
-                _log_death(process.pid, was_hung, process.exitcode, left.get(process.pid, []))
+        for index, process in enumerate(self.processes):
+            began = time.monotonic()
+            if self.should_exit.is_set():
+                return
+            if process.pid in self._retry_at:
+                if began < self._retry_at[process.pid]:
+                    continue
+                del self._retry_at[process.pid]
+            elif self._is_starting(process) or process.is_alive(timeout=HUNG_S):
+                continue
+            else:
+                was_hung = process.exitcode is None and time.monotonic() - began >= HUNG_S  # or it died while asked
+                process.kill()
+                process.join()
+                if process.exitcode == STARTUP_FAILURE:
+                    serving = [each for each in self.processes if each.exitcode is None and _started(each.pid).exists()]
+                    if not serving or self._on_ready is not None:
+                        self.should_exit.set()
+                        return
+                    self._retry_at[process.pid] = time.monotonic() + RETRY_S
+                    logger.error(
+                        "worker %s cannot replace another: %d keep serving, the next try is in %d s",
+                        process.pid,
+                        len(serving),
+                        RETRY_S,
+                    )
+                    continue
+                self._computing |= left_by_dead(Path(os.environ[FOLDER_VARIABLE]))
+                _log_death(process.pid, was_hung, process.exitcode, self._computing.pop(process.pid or 0, []))
+            self.processes[index] = Process(self.config, self.sockets)
+            self.processes[index].start()
         if self._on_ready is not None and all(_started(process.pid).exists() for process in self.processes):
             self._on_ready()
             self._on_ready = None
+
+    def _is_starting(self, process: Process) -> bool:
+        """Whether a worker is still on its way to its first request, in which it answers no health check for long."""
+        if process.exitcode is not None or _started(process.pid).exists():
+            return False
+        now = time.monotonic()
+        return now - self._first_seen.setdefault(process.pid, now) < START_S
 
     def restart_all(self) -> None:
         """Replace each worker, the next one when the new one answers requests, unless one does not start.
@@ -380,6 +420,7 @@ class _Supervisor(Multiprocess):
                 time.sleep(0.1)
                 self.keep_subprocess_alive()
             old, self.processes[index] = self.processes[index], new
+            self._retry_at.pop(old.pid, None)
             old.terminate()
             old.join()
 
@@ -421,7 +462,7 @@ class _Supervisor(Multiprocess):
                     os.kill(process.pid, signal.SIGCONT)
 
 
-def _log_death(pid: int, was_hung: bool, code: int | None, computing: Sequence[str]) -> None:
+def _log_death(pid: int | None, was_hung: bool, code: int | None, computing: Sequence[str]) -> None:
     """Log the end of a worker that another replaces; the supervisor has killed one that was hung."""
     if was_hung:
         how = f"did not answer for {HUNG_S} s and was killed"
@@ -431,7 +472,7 @@ def _log_death(pid: int, was_hung: bool, code: int | None, computing: Sequence[s
             how += ", perhaps because memory ran out,"
     else:
         how = f"exited with code {code}"
-    logger.error("worker %d %s while computing %s; it is replaced", pid, how, " and ".join(computing) or "nothing")
+    logger.error("worker %s %s while computing %s; it is replaced", pid, how, " and ".join(computing) or "nothing")
 
 
 @contextlib.contextmanager

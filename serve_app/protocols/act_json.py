@@ -17,13 +17,13 @@ from rlservo.serve_app.protocols.http_endpoint import (
     receive_body,
 )
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields, parse_json
-from rlservo.serve_app.protocols.routes import GET, POST, Call, Route, of_policy
+from rlservo.serve_app.protocols.routing import GET, POST, Call, Route, of_policy
 from rlservo.serve_app.server import listing
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.sessions.request import Request, reply_fields
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 SUCH_AS = '{"obs": [...]}'
 

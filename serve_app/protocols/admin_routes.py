@@ -17,7 +17,7 @@ from rlservo.errors import RequestError
 from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers
 from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
 from rlservo.serve_app.protocols.request_fields import encode_json, parse_json
-from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route
+from rlservo.serve_app.protocols.routing import GET, POST, Answer, Call, Route
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.logs import OK
 from rlservo.serve_app.server.request_handler import RequestHandler

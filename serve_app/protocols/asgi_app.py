@@ -24,7 +24,7 @@ from rlservo.serve_app.protocols import act_json, admin_routes, pages, websocket
 from rlservo.serve_app.protocols.error_statuses import Headers, error_answer, missing_route, send_reply
 from rlservo.serve_app.protocols.http_endpoint import receive_body
 from rlservo.serve_app.protocols.open_inference import infer, model_info
-from rlservo.serve_app.protocols.routes import GET, WEBSOCKET, Call, Found, Route, RoutingTable
+from rlservo.serve_app.protocols.routing import GET, WEBSOCKET, Call, Found, Route, RoutingTable
 from rlservo.serve_app.server.access_checks import (
     REQUEST_ID,
     OriginChecks,
@@ -34,9 +34,9 @@ from rlservo.serve_app.server.access_checks import (
     presented_key,
 )
 from rlservo.serve_app.server.api_keys import Access
-from rlservo.serve_app.server.exposition import exposition
 from rlservo.serve_app.server.logs import AuditEntry
 from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.sessions.request import TRACEPARENT, ClientGoneError, trace_id
 from rlservo.serve_app.versions.plan_follower import PlanFollower

@@ -10,7 +10,7 @@ from starlette.types import Receive
 
 from rlservo.errors import MediaTypeError
 from rlservo.serve_app.protocols.error_statuses import JSON, Headers, too_large
-from rlservo.serve_app.protocols.routes import Answer, Call
+from rlservo.serve_app.protocols.routing import Answer, Call
 from rlservo.serve_app.server.request_handler import Codec, RequestHandler
 from rlservo.serve_app.sessions.request import ClientGoneError
 

@@ -23,7 +23,7 @@ from rlservo.serve_app.protocols.open_inference.infer import InferRequest, Tenso
 from rlservo.serve_app.protocols.open_inference.model_info import METHODS
 from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.protocols.request_fields import ActRequest
-from rlservo.serve_app.protocols.routes import POST, WEBSOCKET, Route, RoutingTable
+from rlservo.serve_app.protocols.routing import POST, WEBSOCKET, Route, RoutingTable
 from rlservo.serve_app.versions.deployment_plan import Canary
 from rlservo.serve_app.versions.plan_commands import COMMANDS, Changed
 

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rlservo.serve_app.protocols.error_statuses import JSON_HEADERS, Headers
-from rlservo.serve_app.protocols.routes import GET, Answer, Call, Route, RoutingTable
+from rlservo.serve_app.protocols.routing import GET, Answer, Call, Route, RoutingTable
 from rlservo.serve_app.server.api_keys import Access
 
 FOLDER = Path(__file__).with_name("page")

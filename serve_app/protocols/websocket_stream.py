@@ -39,7 +39,7 @@ from rlservo.errors import (
 )
 from rlservo.serve_app.protocols.error_statuses import describe, error_answer, send_reply
 from rlservo.serve_app.protocols.request_fields import ACT, encode_json, fill_request, parse_fields
-from rlservo.serve_app.protocols.routes import WEBSOCKET, Call, Route
+from rlservo.serve_app.protocols.routing import WEBSOCKET, Call, Route
 from rlservo.serve_app.server.access_checks import StreamKey, presented_key
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, check_length
@@ -47,7 +47,7 @@ from rlservo.serve_app.server.metrics import IDLE
 from rlservo.serve_app.server.request_handler import BUG, RequestHandler
 from rlservo.serve_app.sessions.request import Request, new_episode_id, reply_fields
 from rlservo.serve_app.sessions.session import Session
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 logger = logging.getLogger(__name__)
 

@@ -98,7 +98,7 @@ class ObjectStorage:
             self._succeeded(self._call("list_objects_v2", folder, given, into=page, most=PAGE), folder)
             text = page.getvalue().decode(errors="replace")
             if "<ListBucketResult" not in text:
-                raise UnavailableError(f"{self.uri}/{folder}: no list of objects came: check AWS_ENDPOINT_URL")
+                raise UnavailableError(f"{self.uri}/{folder}: the reply lists no objects: check AWS_ENDPOINT_URL")
             found += [key.removeprefix(prefix) for key in re.findall(r"<Key>([^<]+)</Key>", text)]
             if "<IsTruncated>true" not in text:
                 return found
@@ -161,7 +161,7 @@ class ObjectStorage:
                 if not 200 <= connection.status < 300:
                     refusal += block[:REFUSAL]
                 elif length > most:
-                    raise BundleError(f"the storage sends more than the {most:,} bytes that it may")
+                    raise BundleError(f"the storage sent more than the {most:,} bytes allowed")
                 else:
                     into.write(block)
         found = {name.decode("latin-1"): value.decode("latin-1") for name, value in connection.headers}

@@ -48,15 +48,17 @@ def publish(bundle: Bundle, place: str, *, card: str = "", progress: Callable[[s
         check_file_type(file, bundle.path / SUMS_FILE)
     if bundle.contract.name == INDEX:
         raise BundleError(f"a policy named {INDEX} cannot be published: the index of versions has that name")
+    is_signed = False
+    with contextlib.suppress(FileNotFoundError):  # a malformed one is refused before anything is uploaded
+        is_signed = bool(read_signature(bundle.path))
     if isinstance(storage, HubStorage):
         storage.begin(
             {f"{bundle.contract.name}/{bundle.contract.version}/{f}": copy for f, copy in _files(bundle)}, card
         )
     index, tag = Index.read(storage)
-    is_signed = (bundle.path / SIGNATURE_FILE).exists()
     if index.hash_of(bundle) == bundle.digest and is_signed:
         if not _put_signature(storage, bundle):
-            raise ConflictError(f"{target} is there already (this very bundle, with this signature)")
+            raise ConflictError(f"{target} already exists (this very bundle, with this signature)")
         return storage.pinned if isinstance(storage, HubStorage) else target
     content = _with(index, bundle, target)
     if isinstance(storage, FolderStorage):

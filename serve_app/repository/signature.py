@@ -60,6 +60,14 @@ def sign(bundle: Bundle, key: Path, certificate: Path | None = None) -> Path:
     return file
 
 
+def remove_signature(folder: Path) -> bool:
+    """Remove the signature of a bundle that was changed; return whether there was one."""
+    with suppress(FileNotFoundError):
+        (folder / SIGNATURE_FILE).unlink()
+        return True
+    return False
+
+
 def read_signature(folder: Path) -> bytes:
     """Return the content of a bundle's signature, unchecked except that it is one.
 
@@ -75,7 +83,7 @@ def read_signature(folder: Path) -> bytes:
     except OSError as error:
         raise BundleError(f"{file} cannot be read: {error.strerror or error}") from None
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
-        raise BundleError(f"{file} is no signature of OpenSSF Model Signing by a key or a certificate") from None
+        raise BundleError(f"{file} is not an OpenSSF Model Signing signature by a key or a certificate") from None
     return content
 
 
@@ -109,13 +117,13 @@ def check_signature(bundle: Bundle, keys: Path) -> str:
                 if not str(error).startswith(MISMATCH):
                     continue
                 reason = str(error).removeprefix(MISMATCH)[:300]
-                raise BundleError(f"{file} by {name} is for other files than these: {reason}") from None
+                raise BundleError(f"{file}, made with {name}, does not match these files: {reason}") from None
             if SUMS_FILE not in names:  # the format allows this, and an expired certificate
-                raise BundleError(f"{file} by {name} leaves out {SUMS_FILE}, and with it the other files")
+                raise BundleError(f"{file}, made with {name}, does not cover {SUMS_FILE}, and so not the other files")
             if fault:
                 raise BundleError(f"{file} {fault}")
             return name
-    raise BundleError(f"{file} is by none of the keys in {keys} ({', '.join(verifiers)})")
+    raise BundleError(f"{file} was made with none of the keys in {keys} ({', '.join(verifiers)})")
 
 
 def trusted(keys: Path) -> dict[str, Callable[[Path, Path], object]]:
@@ -133,6 +141,9 @@ def trusted(keys: Path) -> dict[str, Callable[[Path, Path], object]]:
     checks: dict[str, Callable[[Path, Path], object]] = {}
     expected = "expected public elliptic keys or certificates, as PEM files in a folder"
     try:
+        others = [f.name for f in sorted(keys.iterdir()) if f.suffix != ".pem" and f.is_file()] if keys.is_dir() else []
+        if others:
+            logger.warning("%s: not *.pem, so not used as keys: %s", keys, ", ".join(others))
         for file in sorted(keys.glob("*.pem")) if keys.is_dir() else [keys]:
             content = file.read_bytes()
             if b"PRIVATE KEY" in content:

@@ -40,6 +40,7 @@ PAGE_SCHEMES = (b"http://", b"https://")  # a proxy may have ended TLS
 HOSTS_REMEMBERED = 256
 REQUEST_ID = b"x-request-id"
 LABEL = LABEL_HEADER.encode()
+HOW = " (rlservo's commands: RLSERVO_API_KEY)"
 ANY_HOST = "*"
 
 
@@ -77,8 +78,8 @@ class OriginChecks:
             raise RequestError("the request has two Host headers: send one")
         if host is not None and not self.permit(host):
             raise ForbiddenError(
-                f"the request names the host '{host[:100].decode('latin-1')}': call it by its address, or name it in "
-                "RLSERVO_ALLOWED_HOSTS"
+                f"the request names the host '{host[:100].decode('latin-1')}': use the server's address, or add the "
+                "name to RLSERVO_ALLOWED_HOSTS"
             )
         if (b"origin" in headers or b"sec-fetch-site" in headers) and (
             scope["type"] == "websocket" or scope["method"] not in READING
@@ -115,8 +116,8 @@ def authorize(keys: CurrentKeys, presented: bytes | None, access: Access) -> Key
             )
         return None
     if presented is None:
-        what = "administration needs an admin" if admin else "this server requires an API"
-        raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'")
+        what, how = ("administration needs an admin", "") if admin else ("this server requires an API", HOW)
+        raise UnauthenticatedError(f"{what} key: send 'Authorization: Bearer KEY'{how}")
     key = accepted.find(presented)
     if key is None:
         raise UnauthenticatedError("the server does not know this API key")

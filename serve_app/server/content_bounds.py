@@ -20,7 +20,7 @@ from rlservo.bundle.contract import Contract
 from rlservo.bundle.spaces import DictSpec, SpaceSpec, TupleSpec, leaf_specs
 from rlservo.errors import TooLargeError
 from rlservo.policy.policy import Policy
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
 
 SMALL = 1 << 14  # [bytes] content up to which no parser takes long
 SPARE = 1000  # values besides observations and states: options, tensors, names

@@ -18,7 +18,7 @@ from rlservo.serve_app.server.access_checks import READING
 from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.sessions.request import Request, trace_id
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 LOGGER = "rlservo"
 FIELDS = "fields"  # attribute of a record that holds its fields

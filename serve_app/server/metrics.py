@@ -30,7 +30,7 @@ from prometheus_client.multiprocess import MultiProcessCollector
 from prometheus_client.registry import Collector
 
 from rlservo.client.formats.request_names import SUCCESS
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 FOLDER_VARIABLE = "PROMETHEUS_MULTIPROC_DIR"  # read by prometheus_client when it is imported
 EVERY_S = 1.0

@@ -38,8 +38,8 @@ from rlservo.serve_app.server.settings import MEMORY, ServerSettings
 from rlservo.serve_app.server.tracing import Tracing
 from rlservo.serve_app.sessions.request import ClientGoneError, Request, check_deadline
 from rlservo.serve_app.sessions.session_actions import Episodes
-from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore, blamed_version
 from rlservo.serve_app.versions.shadow import Shadows
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from rlservo.serve_app.server.api_keys import without_keys
 from rlservo.serve_app.server.content_bounds import count_rows
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.sessions.request import Request, shorten_label, trace_id
-from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 
 with needs_extra("record", what="recording"):
     from rlservo.recording.recorder import Recorder

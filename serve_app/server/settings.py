@@ -211,5 +211,5 @@ class ServerSettings(BaseModel):
             field = cls.model_fields.get(name)
             given_text = "" if field is not None and not field.repr else f" (given: {first['input']!r:.80})"
             raise UsageError(
-                f"{source} is not usable{inside}: {first['msg']}{given_text}{hint}"
+                f"{source} is not usable{inside}: {first['msg'].removeprefix('Value error, ')}{given_text}{hint}"
             ) from None  # it may be a key

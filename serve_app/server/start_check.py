@@ -14,9 +14,9 @@ from rlservo.errors import RlservoError
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_files import PlanFiles
 from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
 LOOK_S = 10.0  # [s] that a start waits for a look through the repository

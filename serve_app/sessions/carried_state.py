@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from rlservo.client.formats.request_names import BELONGS_TO, LAST_ACTION, MARK
 from rlservo.errors import RequestError
 from rlservo.policy.policy import Policy, Step
-from rlservo.serve_app.versions.loaded_versions import EpisodeStep
+from rlservo.serve_app.versions.policy_store import EpisodeStep
 
 MARK_BEGINS = "~"  # no policy's identity has one
 LONGEST_EPISODE_ID = 256

@@ -14,7 +14,7 @@ from typing import TypeAlias
 from rlservo.errors import RlservoError, SessionError, UnavailableError
 from rlservo.serve_app.sessions.request import Request, SessionId, check_client
 from rlservo.serve_app.sessions.session import Session
-from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 
 StepSession: TypeAlias = Callable[[PolicyStore, Request, Session | None], tuple[Decision, Session]]
 """Computes a step: the decision, and the session after it."""

@@ -30,7 +30,7 @@ from rlservo.errors import OverloadedError, UnavailableError, UsageError
 from rlservo.serve_app.sessions.memory_sessions import StepSession, overtaken
 from rlservo.serve_app.sessions.request import Request, check_client, check_deadline
 from rlservo.serve_app.sessions.session import Session
-from rlservo.serve_app.versions.loaded_versions import Decision, PolicyStore
+from rlservo.serve_app.versions.policy_store import Decision, PolicyStore
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +103,10 @@ class RedisSessions:
             async with self._connections:
                 check_deadline(request)
                 if time.perf_counter() - request.received > self._patience_s:
-                    raise OverloadedError(f"other requests kept the session busy for {self._patience_s:g} s: try again")
+                    raise OverloadedError(
+                        f"the session could not be read and written within {self._patience_s:g} s (Redis is slow, or "
+                        "other requests keep the session busy): try again"
+                    )
                 reply = await script(keys=[key], args=arguments)
         except (RedisError, OSError, RuntimeError) as error:  # the last is uvloop's for a closed connection
             self.unreachable += 1

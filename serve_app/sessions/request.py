@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 from rlservo.errors import DeadlineError
 from rlservo.serve_app.sessions.session import Session
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 SessionId: TypeAlias = str | int
 """Triton's clients number their sequences; 7 and "7" are different."""

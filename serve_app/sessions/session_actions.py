@@ -20,7 +20,7 @@ from rlservo.serve_app.sessions.carried_state import carry, parse_state, split_i
 from rlservo.serve_app.sessions.memory_sessions import MemorySessions
 from rlservo.serve_app.sessions.request import Request, SessionId, new_episode_id
 from rlservo.serve_app.sessions.session import Session
-from rlservo.serve_app.versions.loaded_versions import Decision, EpisodeStep, PolicyStore, take_step
+from rlservo.serve_app.versions.policy_store import Decision, EpisodeStep, PolicyStore, take_step
 
 if TYPE_CHECKING:
     from rlservo.serve_app.sessions.redis_sessions import RedisSessions

@@ -1,1 +1,1 @@
-"""Policy versions of a server: repository, plan of aliases and canaries, and the store that acts."""
+"""Policy versions of a server: the plan of aliases and canaries, loading, and the store that chooses one."""

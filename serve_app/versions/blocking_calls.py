@@ -74,4 +74,4 @@ class BlockingCalls:
         finally:
             returned.cancel()  # if it has not returned, its result is no longer wanted
         took = f"{what} took longer than {self._timeout_s:g} s"
-        raise UnavailableError(f"{took} and was given up: does the file system hang?")
+        raise UnavailableError(f"{took} and was given up: does the file system or the object storage answer?")

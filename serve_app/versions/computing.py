@@ -1,4 +1,4 @@
-"""Versions that the threads of a process compute at the moment, in a file that outlives the process.
+"""Versions whose actions a process is computing, in a file that outlives the process.
 
 A graph can end its process (a trap of the processor, too little memory), which then logs nothing itself. So a worker
 writes down what it computes; its supervisor, or the replica that takes its place, logs what a dead one left there.

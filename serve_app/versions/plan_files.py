@@ -179,6 +179,9 @@ def _first_writable(places: Sequence[str]) -> str:
         if is_uri(place):
             if place.startswith("s3://"):
                 return place
-        elif not Path(place, CONTRACT_FILE).exists() and (Path(place, FOLDER).is_dir() or os.access(place, os.W_OK)):
+        # With a slash, which only a folder may have.
+        elif not Path(place, CONTRACT_FILE).exists() and (
+            Path(place, FOLDER).is_dir() or os.access(f"{place}/", os.W_OK)
+        ):
             return place
     return str(plans_folder() / hash_of("\n".join(places)))

@@ -12,9 +12,11 @@ import logging
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rlservo.bundle.contract import version_key
+from rlservo.bundle.production import hash_of
 from rlservo.errors import (
     BundleError,
     ConflictError,
@@ -26,9 +28,9 @@ from rlservo.errors import (
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.repository.repository import Key, Listing
 from rlservo.serve_app.versions.deployment_plan import Loadable, Plan, PolicyPlan, ServedConfig
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_commands import Command, Load, Poll, agrees, differences, first_policies
 from rlservo.serve_app.versions.plan_files import PlanFiles
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.version_loader import VersionLoader
 
 logger = logging.getLogger(__name__)
@@ -70,12 +72,15 @@ class PlanFollower:
 
     # Change the plan.
 
-    async def configure(self, document: Any) -> None:
+    async def configure(self, document: Any, server_folder: Path | None = None) -> None:
         """Serve the plan; if the repository has none yet, first write the one that a configuration means.
 
-        If object storage is unreachable, the last plan that this machine has read is used. Raises UsageError,
-        BundleError and UnavailableError.
+        If object storage is unreachable, the last plan that this machine has read is used. `server_folder` lives as
+        long as the server: a process that starts in place of another begins no plan if the one that the others follow
+        is lost, because it would serve other versions than they do. Raises UsageError, BundleError and
+        UnavailableError.
         """
+        followed = None if server_folder is None else server_folder / f"{hash_of(self.files.place)}.followed"
         self._config = ServedConfig.parse(document)
         try:
             plan = await self.files.call(self.files.newest)
@@ -85,6 +90,11 @@ class PlanFollower:
                 raise
             logger.warning("%s: serving plan %d, the last one that was seen here", error.message, plan.generation)
         if plan is None:
+            if self.plan is not None or (followed is not None and followed.exists()):
+                raise UnavailableError(
+                    f"{self.files.place} has lost the plan that this server follows: restore it, or begin another with "
+                    "`rlservo policy load NAME --repository PLACE`"
+                )
             plan = await self._write(await self._unwritten(), None, "")
         elif document and not agrees(plan, self._config):
             logger.warning(
@@ -95,6 +105,8 @@ class PlanFollower:
             )
         await self.files.call(self.files.note_places)
         await self._apply(plan)
+        if followed is not None:
+            followed.touch()
 
     async def give(self, command: Command, name: str) -> Plan:
         """Carry out a command on a policy as `write` does; return the plan when this process serves it."""

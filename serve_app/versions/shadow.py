@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rlservo.errors import RlservoError
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.versions.computing import Computing
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 logger = logging.getLogger(__name__)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import register, registry
 
+from bundles import rewrite_contract, write_box_policy
 from rlservo.bundle.bundle import load_bundle
 from rlservo.bundle.spaces import BoxSpec
 from rlservo.client.policy_client import PolicyClient
@@ -30,7 +30,8 @@ from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.deployment_plan import Canary, PolicyPlan
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import over_uvicorn
 from stores import control_of
 
 OBS = np.linspace(-1, 1, 27).astype(np.float32)
@@ -66,7 +67,7 @@ class Server:
 
 
 @pytest.fixture
-def serve(served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Callable[..., Server]]:
+def serve() -> Iterator[Callable[..., Server]]:
     with contextlib.ExitStack() as stack:
 
         def start(*folders: Path) -> Server:
@@ -74,7 +75,7 @@ def serve(served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Call
             server = Server(policies, PolicyStore([], {}))
             server.move("1")
             app = create_app(control_of(lambda: server.store), ServerSettings())
-            server.url = f"http://127.0.0.1:{stack.enter_context(served(app))}"
+            server.url = f"http://127.0.0.1:{stack.enter_context(over_uvicorn(app))}"
             server.handler = app.handler
             return server
 
@@ -82,8 +83,8 @@ def serve(served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Call
 
 
 @pytest.fixture
-def arms(serve: Callable[..., Server], box_policy: Callable[..., Path], tmp_path: Path) -> Server:
-    return serve(*(box_policy(tmp_path, version=version, seed=seed) for seed, version in enumerate("12")))
+def arms(serve: Callable[..., Server], tmp_path: Path) -> Server:
+    return serve(*(write_box_policy(tmp_path, version=version, seed=seed) for seed, version in enumerate("12")))
 
 
 @pytest.fixture
@@ -212,9 +213,9 @@ def test_episode_with_a_state_ends_with_the_version_that_began_it(
 
 @CLIENTS
 def test_version_that_remembers_takes_over_from_one_that_does_not(
-    serve: Callable[..., Server], box_policy: Callable[..., Path], tmp_path: Path, kind: Kind
+    serve: Callable[..., Server], tmp_path: Path, kind: Kind
 ) -> None:
-    one, two = (box_policy(tmp_path, version=version, seed=seed) for seed, version in enumerate("12"))
+    one, two = (write_box_policy(tmp_path, version=version, seed=seed) for seed, version in enumerate("12"))
     server = serve(one)
     server.policies.append(Policy.load(two, options=PolicyOptions(max_action_step=0.01)))
     with kind(server.url, "ur5", deadline_ms=20_000) as client:
@@ -229,10 +230,9 @@ def test_version_that_remembers_takes_over_from_one_that_does_not(
 
 @CLIENTS
 def test_action_of_a_version_with_other_spaces_is_never_used(
-    serve: Callable[..., Server], box_policy: Callable[..., Path], rewrite_contract: Callable[..., None],
-    tmp_path: Path, kind: Kind,
-) -> None:  # fmt: skip
-    one, two = (box_policy(tmp_path, version=version) for version in "12")
+    serve: Callable[..., Server], tmp_path: Path, kind: Kind
+) -> None:
+    one, two = (write_box_policy(tmp_path, version=version) for version in "12")
     space = Policy.load(one).contract.action_space
     assert isinstance(space, BoxSpec)
     rewrite_contract(two, action_space=space.model_copy(update={"elements": space.elements[::-1]}))

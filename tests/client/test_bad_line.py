@@ -12,7 +12,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +34,13 @@ from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import over_uvicorn
 from stores import control_of, load_store
 
 ROOT = Path(__file__).resolve().parents[2]
 UR5 = "rlservo/EndEffectorPositioningURSim-v0"
 KEY, LINE = new_key("robot", explore=True)
-Serve = Callable[[Any], AbstractContextManager[int]]
 Client = PolicyClient | StreamClient
 KINDS = pytest.mark.parametrize("kind", [PolicyClient, StreamClient])
 
@@ -159,8 +158,8 @@ def store(recurrent: Path, shipped: Path) -> PolicyStore:
 
 
 @pytest.fixture(scope="module")
-def port(store: PolicyStore, served: Serve) -> Iterator[int]:
-    with served(create_app(control_of(store), ServerSettings(api_keys=LINE))) as port:
+def port(store: PolicyStore) -> Iterator[int]:
+    with over_uvicorn(create_app(control_of(store), ServerSettings(api_keys=LINE))) as port:
         yield port
 
 
@@ -327,10 +326,13 @@ def test_an_episode_whose_state_travels_survives_any_line(
 
 @KINDS
 def test_a_memory_that_died_with_its_server_is_reported_and_not_begun_anew(
-    kind: type[Client], line: FaultyLine, recurrent: Path, served: Serve, store: PolicyStore
+    kind: type[Client], line: FaultyLine, recurrent: Path, store: PolicyStore
 ) -> None:
     seen = [np.full(3, 0.1 * i, np.float32) for i in range(6)]
-    with Policy.load(recurrent / "lstm_box") as here, served(create_app(control_of(store), ServerSettings())) as other:
+    with (
+        Policy.load(recurrent / "lstm_box") as here,
+        over_uvicorn(create_app(control_of(store), ServerSettings())) as other,
+    ):
         expected = [here.act(obs) for obs in seen]
         with (
             connected(kind, line, "lstm_box", server_state=True) as held,
@@ -446,7 +448,7 @@ def test_the_client_is_told_what_was_commanded_instead(line: FaultyLine) -> None
         ("ur5", [0.0] * 4, "expects shape"),
         ("ur5", [0.0] * 4 + [7.0], "within -1 to 1"),
         ("ur5", {"x": 1}, "is not an action of policy 'ur5'"),
-        ("lstm_previous", "zero", "is a choice, and zero is one of the choices: give an action"),
+        ("lstm_previous", "zero", "is discrete, and 0 is one of its choices, not a stop: give an action"),
         ("lstm_previous", 4, "expects shape"),
         ("act_nested", {"a": [[1.0], 1]}, "must be a map with the keys a, b"),
     ],

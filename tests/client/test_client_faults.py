@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bundles import PARITY, PROVENANCE
-from rlservo.bundle.contract import Contract, TensorSpec
+from bundles import contract_of
 from rlservo.bundle.spaces import BoxSpec
 from rlservo.client.http_transport import Transport
 from rlservo.client.policy_client import PolicyClient
@@ -33,18 +32,12 @@ from rlservo.errors import (
 )
 from servers import free_ports
 
-CONTRACT = Contract(
-    name="arm",
+CONTRACT = contract_of(
+    "arm",
+    BoxSpec(shape=(3,), dtype="float32", low=None, high=None),
+    BoxSpec(shape=(2,), dtype="float32", low=-1.0, high=1.0),
     version="3",
-    observation_space=BoxSpec(shape=(3,), dtype="float32", low=None, high=None),
-    action_space=BoxSpec(shape=(2,), dtype="float32", low=-1.0, high=1.0),
-    inputs=(TensorSpec(name="obs", dtype="float32", shape=(-1, 3)),),
-    outputs=(TensorSpec(name="action", dtype="float32", shape=(-1, 2)),),
-    distribution=None,
-    baked_in=(),
     control_rate_hz=10.0,
-    provenance=PROVENANCE,
-    parity=PARITY,
 )
 OBS = np.array([0.1, 0.2, 0.3], np.float32)
 GOOD = [0.25, -0.5]

@@ -28,7 +28,7 @@ from rlservo.errors import (
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from stores import control_of, load_store
 
 

@@ -11,7 +11,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import register, registry
 
+from bundles import controlled, write_box_policy
 from rlservo.client.admin_client import AdminClient
 from rlservo.client.policy_client import PolicyClient
 from rlservo.client.promotion import (
@@ -43,8 +44,8 @@ from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
+from servers import over_uvicorn
 
-Serve = Callable[[Any], AbstractContextManager[int]]
 KEY, LINE = new_key("boss", admin=True)
 SETTINGS = ServerSettings(operator_key=LINE.split()[-1])
 OBS = [0.5] * 27
@@ -127,16 +128,14 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def running(
-    box_policy: Callable[..., Path], controlled: Any, served: Serve, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Server]:
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     root = tmp_path_factory.mktemp("promotion")
     for version, seed, scale in (("1", 0, 1.0), ("2", 0, 1.0), ("3", 0, 400.0), ("4", 7, 1.0)):
-        box_policy(root, version=version, seed=seed, action_scale=scale)
+        write_box_policy(root, version=version, seed=seed, action_scale=scale)
     with controlled(root, config=CONFIG) as control:
         server = Server(control)
         server.restart()
-        with served(server) as server.port:
+        with over_uvicorn(server) as server.port:
             yield server
 
 
@@ -153,11 +152,11 @@ def server(running: Server) -> Server:
 
 
 @pytest.fixture
-def other(server: Server, served: Serve) -> Iterator[Server]:
+def other(server: Server) -> Iterator[Server]:
     """A second server that follows the same plan."""
     second = Server(server.control, replica="other")
     second.restart()
-    with served(second) as second.port:
+    with over_uvicorn(second) as second.port:
         yield second
 
 
@@ -487,6 +486,13 @@ def test_what_cannot_be_promoted_is_refused_before_anything_is_changed(
     assert server.control.plan is before and not promotion.log.exists()
 
 
+def test_a_policy_that_is_not_served_is_refused_by_its_name(run: Any, server: Server) -> None:
+    promotion = run()
+    promotion.terms = replace(promotion.terms, policy="mir")
+    with pytest.raises(UsageError, match="policy 'mir' is not served; 'rlservo policy load mir 2' loads it"):
+        promotion()
+
+
 def test_a_canary_or_shadow_of_another_operator_is_in_the_way(run: Any, server: Server) -> None:
     with server.admin() as admin:
         admin.shadow("ur5", "4")
@@ -619,11 +625,11 @@ def test_a_key_that_is_revoked_leaves_it_unfinished_and_the_way_on_is_said(
 
 
 def test_a_server_that_ends_leaves_it_unfinished_and_the_way_on_is_said(
-    run: Any, server: Server, served: Serve, monkeypatch: pytest.MonkeyPatch
+    run: Any, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """After a minute in which it cannot be judged, and another in which it cannot be rolled back."""
     with ExitStack() as ends:
-        monkeypatch.setattr(server, "port", ends.enter_context(served(server)))
+        monkeypatch.setattr(server, "port", ends.enter_context(over_uvicorn(server)))
         promotion = run(seconds=600.0)
 
         def end() -> None:

@@ -19,6 +19,7 @@ import pytest
 import yaml
 from compose_spec import PyCompose
 
+from clusters import SWITCHES
 from documents import HOW_TO, blocks
 from rayservice_schema import POD_MONITOR, RAY_SERVICE
 from rlservo.serve_app.server.api_keys import Keys, new_key
@@ -136,8 +137,9 @@ def test_replicas_of_a_change_find_room_beside_those_they_replace() -> None:
 def test_nodes_have_rays_documented_switches_and_settings_of_ours() -> None:
     stated = OBJECTS["cluster-environment.yaml:ConfigMap/rlservo-cluster-environment"]["data"]
     rays = {name: value for name, value in stated.items() if name.startswith("RAY_")}
-    switches = {"RAY_SERVE_ENABLE_HA_PROXY": "1", "RAY_SERVE_THROUGHPUT_OPTIMIZED": "1"}
-    assert rays == {"RAY_AUTH_MODE": "token", **switches}
+    assert rays == SWITCHES
+    pages = [DEPLOY.parent / page for page in ("README.md", "docs/how-to/ray-and-kubernetes.md", "deploy/serve.yaml")]
+    assert all(f" {name}={value}" in page.read_text() for page in pages for name, value in SWITCHES.items())
     own = {name.removeprefix(PREFIX).lower() for name in stated if name.startswith(PREFIX)}
     assert own <= set(ServerSettings.model_fields)
     for group in GROUPS.values():

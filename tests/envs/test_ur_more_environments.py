@@ -9,12 +9,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 
 from rlservo.envs.ur.basic_avoidance import BasicAvoidanceURSim
 from rlservo.envs.ur.empty_environment import EmptyEnvironmentURSim
-from rlservo.robots.checks import InvalidActionError, InvalidResetError
-from rlservo.robots.ur.parameters import UR_PARAMETERS
+from rlservo.robots.argument_checks import InvalidResetError
 
 # robo-gym's bounds: three elements of BasicAvoidance are always zero.
 pytestmark = pytest.mark.filterwarnings("ignore:.*A Box observation space maximum and minimum values are equal")
@@ -39,49 +37,6 @@ def avoidance(**arguments: Any) -> BasicAvoidanceURSim:
 
 
 # -- both
-
-
-@pytest.mark.filterwarnings("ignore:.*A Box observation space (minimum|maximum) value is:UserWarning")
-@pytest.mark.parametrize("ur_model", list(UR_PARAMETERS))
-@BOTH
-def test_gymnasium_check_env_passes(env_id: str, ur_model: str) -> None:
-    check_env(gym.make(env_id, ur_model=ur_model).unwrapped, skip_render_check=True)
-
-
-@pytest.mark.parametrize("arguments", [{}, {"fix_base": True}, {"fix_wrist_3": False, "action_cycle_rate": 10}])
-@BOTH
-def test_description_names_every_element(env_id: str, arguments: dict[str, Any]) -> None:
-    env = gym.make(env_id, **arguments).unwrapped
-    description = type(env).describe(**arguments)
-    assert env.observation_space.shape == (len(description["observation"]),)
-    assert env.action_space.shape == (len(description["action"]),)
-    assert description["control_rate_hz"] == arguments.get("action_cycle_rate", 20)
-    assert env.metadata["render_fps"] == description["control_rate_hz"]
-    names = [element["name"] for element in description["observation"]]
-    assert len(set(names)) == len(names)
-
-
-@BOTH
-def test_same_seed_and_actions_give_the_same_episode(env_id: str) -> None:
-    runs = []
-    for _ in range(2):
-        env = gym.make(env_id).unwrapped
-        env.action_space.seed(3)
-        observation, _ = env.reset(seed=5)
-        rows = [observation]
-        for _ in range(40):
-            observation, *_ = env.step(0.2 * env.action_space.sample())
-            rows.append(observation)
-        runs.append(np.array(rows))
-    assert (runs[0] == runs[1]).all()
-
-
-@BOTH
-def test_action_outside_the_space_is_refused_by_element(env_id: str) -> None:
-    env = gym.make(env_id).unwrapped
-    env.reset(seed=0)
-    with pytest.raises(InvalidActionError, match=r"element 2 \(elbow_\w+\) is 1.5, 0.5 above its range"):
-        env.step([0, 0, 1.5, 0, 0])
 
 
 @BOTH

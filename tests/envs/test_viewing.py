@@ -10,7 +10,7 @@ import pytest
 
 from rlservo.envs.rendering import RenderedEnv
 from rlservo.envs.shapes import Poses, body_poses, moving_bodies, visible_shapes
-from rlservo.robots.checks import InvalidResetError
+from rlservo.robots.argument_checks import InvalidResetError
 
 IDS = (
     "EndEffectorPositioningURSim-v0",

@@ -103,6 +103,7 @@ def test_these_policies_ship() -> None:
         "panda_positioning",
         "pendulum_sac",
         "ur10_isaac_reach",
+        "ur10e_isaac_deploy_reach",
         "ur5_positioning",
         "ur5_positioning_disturbed",
         "ur_positioning",
@@ -143,9 +144,32 @@ def test_each_can_be_trained_from_its_settings(monkeypatch: pytest.MonkeyPatch) 
     train_shipped = load("train_shipped")
     for name in NAMES:
         settings = evaluate_shipped.load_settings(name) | {"envs": 1}
+        if "trainer" in settings:
+            continue
         runner = SingleAgentEnvRunner(config=train_shipped.algorithm_config(settings, 0), worker_index=0)
         assert sum(map(len, runner.sample(num_timesteps=2, explore=False))) == 2, name
         runner.stop()
+
+
+@pytest.mark.slow
+def test_a_training_with_rsl_rl_leaves_a_run_that_exports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pytest.importorskip("rsl_rl")
+    monkeypatch.syspath_prepend(EXAMPLES)
+    name = "ur10e_isaac_deploy_reach"
+    few = {"episodes": 4, "updates": 300, "rate": 0.002, "gain": 8.0, "largest": 1.5}
+    settings = evaluate_shipped.load_settings(name) | {"envs": 1, "imitate": few}
+    training = importlib.import_module("shared.rsl_rl_training")
+    monkeypatch.setattr(training, "NORMALIZED", 5000)
+    run = training.RslRlRun(settings, SHIPPED / name)
+    steps, *_ = next(run.iterations(1))
+    run.save_to_path(str(tmp_path / "run"))
+    run.stop()
+    exported = export_checkpoint(tmp_path / "run", tmp_path, name="reach", notify=lambda line: None)
+    assert exported.contract.provenance.env_steps == steps == 128
+    with Policy.load(exported.path) as policy:
+        start = np.array([math.pi, -math.pi / 2, math.pi / 2, -math.pi / 2, -math.pi / 2, 0.0, *[0.0] * 6])
+        seen = [*start, 0.9, -0.2, 0.2, 0.7, -0.7, 0.0, 0.0]
+        assert 0.0 < np.abs(policy.act(np.array(seen, np.float32)) - start[:6]).max() < 1.0
 
 
 def test_the_recurrent_policy_needs_its_memory(bundles: dict[str, Path]) -> None:
@@ -176,7 +200,10 @@ def test_each_card_states_what_was_measured(name: str) -> None:
     figures = [evaluate_shipped.Evaluation(**one) for one in card_figures(name)]
     table = card.partition(evaluate_shipped.BEGIN)[2].partition(evaluate_shipped.END)[0].strip()
     assert table == evaluate_shipped.render(figures)
-    assert {(one.episodes, one.seed) for one in figures} == {(evaluate_shipped.EPISODES, evaluate_shipped.SEED)}
+    ((episodes, seed),) = {(one.episodes, one.seed) for one in figures}
+    assert episodes == evaluate_shipped.EPISODES
+    assert f"seeds {seed} to {seed + episodes - 1}" in card
+    assert seed == evaluate_shipped.SEED or f"python examples/evaluate_shipped.py {name} --seed {seed}" in card
     for part in ("## Training", "## Failure modes", "](curve.png)", "```sh\npython examples/"):
         assert part in card, part
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 
 pytest.importorskip("onnx")  # compiling needs it; the newest Python runs the unit tests without
 
+from bundles import write_leaky_policy
 from rlservo.errors import BundleError, BundleTamperedError, ObservationError, RequestError
 from rlservo.export.compiled.compile import Compiled, compile_bundle
 from rlservo.policy.compiled_policy import CompiledPolicy, open_policy
@@ -23,10 +23,10 @@ OBS = np.linspace(-1, 1, 27, dtype=np.float32)
 
 
 @pytest.fixture(scope="module")
-def leaky(leaky_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compiled]:
+def leaky(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Compiled]:
     """A policy with a memory: its bundle, and its C."""
     root = tmp_path_factory.mktemp("leaky")
-    bundle = leaky_policy(root)
+    bundle = write_leaky_policy(root)
     return bundle, compile_bundle(bundle, root / "c")
 
 

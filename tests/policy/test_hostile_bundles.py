@@ -14,7 +14,6 @@ import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ import onnxruntime
 import pytest
 from onnx import helper, numpy_helper
 
+from bundles import rewrite_contract, write_box_policy
 from rlservo.bundle import bundle as bundle_files
 from rlservo.bundle.bundle import BundleLimits, load_bundle, read_contract
 from rlservo.bundle.regular_files import open_regular
@@ -47,14 +47,13 @@ from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.server.start_check import load_served
 from rlservo.serve_app.versions.blocking_calls import BlockingCalls
 from rlservo.serve_app.versions.deployment_plan import ServedConfig
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
 from rlservo.serve_app.versions.plan_commands import Load, SetAlias
 from rlservo.serve_app.versions.plan_follower import PlanFollower
+from rlservo.serve_app.versions.policy_store import PolicyStore
 from rlservo.serve_app.versions.version_loader import VersionLoader
+from servers import over_uvicorn
 from stores import plan_files
 from waiting import until
-
-Serve = Callable[[Any], AbstractContextManager[int]]
 
 FILES = ("contract.json", "policy.onnx", "policy.ts", "golden.npz", "SHA256SUMS")
 OBS = np.zeros(27, np.float32) + 0.1
@@ -79,13 +78,13 @@ def patience(request: pytest.FixtureRequest) -> dict[str, float]:
 
 
 @pytest.fixture
-def url(root: Path, served: Serve, patience: dict[str, float]) -> Iterator[str]:
+def url(root: Path, patience: dict[str, float]) -> Iterator[str]:
     """A server of ur5 in 1 and 2, and of gridworld."""
     loader = VersionLoader(Repository([root]), **patience)
     control = PlanFollower(loader, plan_files(root))
     asyncio.run(control.configure({}))
     app = create_app(control, ServerSettings(operator_key=DIGEST), replica="r")
-    with served(app) as port:
+    with over_uvicorn(app) as port:
         yield f"http://127.0.0.1:{port}"
 
 
@@ -241,7 +240,7 @@ def test_golden_vectors_that_claim_more_than_they_hold_are_refused(root: Path) -
         Policy.load(folder)
 
 
-def test_a_contract_that_asks_for_all_the_memory_is_refused(root: Path, rewrite_contract: Callable[..., None]) -> None:
+def test_a_contract_that_asks_for_all_the_memory_is_refused(root: Path) -> None:
     folder = root / "ur5" / "2"
     space = BoxSpec(shape=(1 << 20, 1 << 20), dtype="float32", low=None, high=None)
     tensor = read_contract(folder).inputs[0].model_copy(update={"shape": (-1, 1 << 20, 1 << 20)})
@@ -266,10 +265,8 @@ print("%.2f" % (time.process_time() - began))
 """
 
 
-def test_a_graph_that_does_not_come_to_an_end_is_given_up_and_computes_no_further(
-    box_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    folder = box_policy(tmp_path)
+def test_a_graph_that_does_not_come_to_an_end_is_given_up_and_computes_no_further(tmp_path: Path) -> None:
+    folder = write_box_policy(tmp_path)
     model = onnx.load(folder / bundle_files.ONNX_FILE)
     tensors = {"value": onnx.TensorProto.FLOAT, "go_on": onnx.TensorProto.BOOL, "turn": onnx.TensorProto.INT64}
     infos = {
@@ -375,19 +372,17 @@ ONLY_NEW = pytest.mark.skipif(IS_OLD, reason="a division by zero ends this onnxr
     ],
 )
 def test_an_integer_division_that_could_end_the_process_is_refused(
-    box_policy: Callable[..., Path], tmp_path: Path, nodes: list[Any], more: dict[str, Any]
+    tmp_path: Path, nodes: list[Any], more: dict[str, Any]
 ) -> None:
-    folder = box_policy(tmp_path)
+    folder = write_box_policy(tmp_path)
     with_nodes(folder, *nodes, **more)
     ours = r"divides integers by a number that may be .*-1, which ends the process.*, or export the policy again$"
     with pytest.raises(BundleError, match=ours):
         Policy.load(folder, check_golden=False)
 
 
-def test_a_division_that_could_end_the_server_is_refused_by_it(
-    url: str, admin: AdminClient, box_policy: Callable[..., Path], root: Path
-) -> None:
-    with_nodes(box_policy(root, version="10"), *divided())
+def test_a_division_that_could_end_the_server_is_refused_by_it(url: str, admin: AdminClient, root: Path) -> None:
+    with_nodes(write_box_policy(root, version="10"), *divided())
     with pytest.raises((RefusedError, RequestError), match="divides integers by a number that may be "):
         admin.load("ur5", "10")
     work_goes_on(admin, url)
@@ -406,9 +401,9 @@ def test_a_division_that_could_end_the_server_is_refused_by_it(
     ids=["constant", "constants", "fmod", "floating-point", "absolute", "in a branch"],
 )
 def test_a_division_that_cannot_end_the_process_is_loaded(
-    box_policy: Callable[..., Path], tmp_path: Path, nodes: list[Any], more: dict[str, Any]
+    tmp_path: Path, nodes: list[Any], more: dict[str, Any]
 ) -> None:
-    folder = box_policy(tmp_path)
+    folder = write_box_policy(tmp_path)
     with_nodes(folder, *nodes, **more)
     with Policy.load(folder, check_golden=False) as policy:
         assert policy.act(np.ones(policy.contract.observation_space.shape, np.float32)) is not None
@@ -518,25 +513,23 @@ HARMLESS: dict[str, list[Any]] = {
 
 
 @pytest.mark.parametrize("kind", SLOW)
-def test_a_graph_whose_time_depends_on_an_observation_is_refused(
-    box_policy: Callable[..., Path], tmp_path: Path, kind: str
-) -> None:
-    folder = box_policy(tmp_path)
+def test_a_graph_whose_time_depends_on_an_observation_is_refused(tmp_path: Path, kind: str) -> None:
+    folder = write_box_policy(tmp_path)
     with_nodes(folder, *COUNTED, *SLOW[kind], *ENDING, constants=CONSTANTS)
     with pytest.raises(BundleError, match=r"the size, repetitions or branch of \w+ '\w+' depend on the observation"):
         Policy.load(folder)
 
 
 @pytest.mark.parametrize("kind", HARMLESS)
-def test_a_graph_whose_sizes_are_fixed_is_loaded(box_policy: Callable[..., Path], tmp_path: Path, kind: str) -> None:
-    folder = box_policy(tmp_path)
+def test_a_graph_whose_sizes_are_fixed_is_loaded(tmp_path: Path, kind: str) -> None:
+    folder = write_box_policy(tmp_path)
     with_nodes(folder, *COUNTED, *HARMLESS[kind], *ENDING, constants=CONSTANTS)
     with Policy.load(folder) as policy:
         assert policy.act(OBS).shape == (6,)
 
 
-def test_a_graph_that_always_takes_long_is_refused(box_policy: Callable[..., Path], tmp_path: Path) -> None:
-    folder = box_policy(tmp_path)
+def test_a_graph_that_always_takes_long_is_refused(tmp_path: Path) -> None:
+    folder = write_box_policy(tmp_path)
     with_nodes(folder, turning("many"), *ENDING, constants=CONSTANTS)
     with pytest.raises(
         BundleError, match=r"computed for \d+\.\d s on an observation of \de[+-]\d\d, and may take at most 1 s"
@@ -735,8 +728,8 @@ print(resident("VmHWM") - before, resident("VmRSS") - before)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-def test_a_large_graph_is_in_memory_about_once(policies: Path, tmp_path: Path, box_policy: Callable[..., Path]) -> None:
-    folder = box_policy(tmp_path, name="large")
+def test_a_large_graph_is_in_memory_about_once(policies: Path, tmp_path: Path) -> None:
+    folder = write_box_policy(tmp_path, name="large")
     model = onnx.load(folder / "policy.onnx")
     rng = np.random.default_rng(0)
     wide = 5000

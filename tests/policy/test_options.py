@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import random
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
+from bundles import rewrite_contract, write_box_policy, write_discrete_policy
 from rlservo.bundle.bundle import read_contract
 from rlservo.bundle.spaces import BoxSpec
 from rlservo.errors import ActionError, ObservationError, UsageError
@@ -22,6 +22,7 @@ from rlservo.policy.options import PolicyOptions
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import over_uvicorn
 from stores import control_of, load_store
 
 ZEROS = np.zeros(27, np.float32)
@@ -29,11 +30,9 @@ OUTSIDE = np.where(np.arange(27) == 3, np.float32(1.5), ZEROS)
 
 
 @pytest.fixture
-def bounded(
-    box_policy: Callable[..., Path], tmp_path: Path, rewrite_contract: Callable[..., None]
-) -> Callable[..., Policy]:
+def bounded(tmp_path: Path) -> Callable[..., Policy]:
     """Load a policy whose observations are within [-1, 1]."""
-    folder = box_policy(tmp_path)
+    folder = write_box_policy(tmp_path)
     space = read_contract(folder).observation_space
     rewrite_contract(folder, observation_space=space.model_copy(update={"low": -1.0, "high": 1.0}))
     return lambda **options: Policy.load(folder, options=PolicyOptions(**options))
@@ -121,9 +120,9 @@ def test_a_step_that_does_not_fit_the_action_is_refused_at_load(
         bounded(max_action_step=step)
 
 
-def test_a_choice_has_no_step(discrete_policy: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_choice_has_no_step(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="action is a choice, which has no step size"):
-        Policy.load(discrete_policy(tmp_path), options=PolicyOptions(max_action_step=1.0))
+        Policy.load(write_discrete_policy(tmp_path), options=PolicyOptions(max_action_step=1.0))
 
 
 def test_options_come_from_the_environment_by_policy_name() -> None:
@@ -136,14 +135,12 @@ def test_options_come_from_the_environment_by_policy_name() -> None:
             ServerSettings.from_environment(environment={"RLSERVO_POLICY_OPTIONS": wrong})
 
 
-def test_a_served_policy_has_its_options_and_says_what_they_did(
-    bounded: Callable[..., Policy], served: Callable[[Any], AbstractContextManager[int]]
-) -> None:
+def test_a_served_policy_has_its_options_and_says_what_they_did(bounded: Callable[..., Policy]) -> None:
     folder = bounded().path
     options = {"ur5": PolicyOptions(out_of_bounds="clip", max_action_step=0.1), "*": PolicyOptions()}
     store = load_store(folder, options=options)
     free = bounded(out_of_bounds="accept")
-    with served(create_app(control_of(store), ServerSettings())) as port, httpx.Client() as client:
+    with over_uvicorn(create_app(control_of(store), ServerSettings())) as port, httpx.Client() as client:
 
         def act(**request: Any) -> Any:
             return client.post(f"http://127.0.0.1:{port}/v1/policies/ur5/act", json=request).json()

@@ -8,13 +8,13 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import onnxruntime
 import pytest
 
+from bundles import rewrite_contract, write_box_policy, write_discrete_policy
 from rlservo.bundle.bundle import load_bundle, read_contract, write_contract, write_golden
 from rlservo.bundle.contract import Contract, Distribution, StateSpec
 from rlservo.errors import (
@@ -68,10 +68,8 @@ def test_a_batch_gives_a_batch_whose_rows_are_the_single_actions(policy: Policy)
     assert policy.act(batch[:1]).shape == (1, 6)
 
 
-def test_a_discrete_policy_gives_integers_of_its_own_range(
-    discrete_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    policy = Policy.load(discrete_policy(tmp_path, start=3))
+def test_a_discrete_policy_gives_integers_of_its_own_range(tmp_path: Path) -> None:
+    policy = Policy.load(write_discrete_policy(tmp_path, start=3))
     assert policy.act(2).shape == () and policy.act(2).dtype == np.int64
     assert set(policy.act([0, 1, 2, 3, 4]).tolist()) <= {3, 4, 5}
     assert policy.act(2.0) == policy.act(np.int32(2)) == policy.act(2)
@@ -137,40 +135,34 @@ def test_exploring_is_repeatable_by_seed_and_follows_the_distribution(ur5: Path,
     assert (np.abs(samples) <= 1).all()
 
 
-def test_a_discrete_policy_explores_with_the_softmax_frequencies(
-    discrete_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    folder = discrete_policy(tmp_path)
+def test_a_discrete_policy_explores_with_the_softmax_frequencies(tmp_path: Path) -> None:
+    folder = write_discrete_policy(tmp_path)
     (logits,) = onnxruntime.InferenceSession(folder / "policy.onnx").run(["action_dist_inputs"], {"obs": np.array([2])})
     expected = np.exp(logits[0]) / np.exp(logits[0]).sum()
     drawn = Policy.load(folder).act([2] * 20000, explore=True, seed=3)
     np.testing.assert_allclose(np.bincount(drawn, minlength=3) / 20000, expected, atol=0.015)
 
 
-def test_a_policy_without_a_distribution_refuses_to_explore(
-    discrete_policy: Callable[..., Path], tmp_path: Path, rewrite_contract: Callable[..., None]
-) -> None:
-    folder = discrete_policy(tmp_path)
+def test_a_policy_without_a_distribution_refuses_to_explore(tmp_path: Path) -> None:
+    folder = write_discrete_policy(tmp_path)
     rewrite_contract(folder, distribution=None)
     with pytest.raises(RequestError, match="cannot explore"):
         Policy.load(folder).act(1, explore=True)
 
 
-def test_an_action_outside_its_space_never_leaves(box_policy: Callable[..., Path], tmp_path: Path) -> None:
-    policy = Policy.load(box_policy(tmp_path, action_scale=5.0))
+def test_an_action_outside_its_space_never_leaves(tmp_path: Path) -> None:
+    policy = Policy.load(write_box_policy(tmp_path, action_scale=5.0))
     with pytest.raises(ActionError, match=r"element \d \(joint_\d\) is -?[\d.]+, not in \[-[12], [12]\]"):
         policy.act(OBS * 3)
     with pytest.raises(ActionError):
         policy.act(np.stack([OBS * 0, OBS * 3]))
 
 
-def test_a_non_finite_action_never_leaves_even_an_unbounded_space(
-    box_policy: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_non_finite_action_never_leaves_even_an_unbounded_space(tmp_path: Path) -> None:
     import onnx
     from onnx import numpy_helper
 
-    folder = box_policy(tmp_path, unbounded=True)
+    folder = write_box_policy(tmp_path, unbounded=True)
     model = onnx.load(folder / "policy.onnx")
     bias = next(tensor for tensor in model.graph.initializer if tensor.name == "b3")
     bias.CopyFrom(numpy_helper.from_array(np.array([0, 0, np.inf, 0, 0, 0], np.float32), "b3"))
@@ -182,10 +174,8 @@ def test_a_non_finite_action_never_leaves_even_an_unbounded_space(
             policy.act(obs)
 
 
-def test_an_overshoot_of_rounding_is_clipped(
-    box_policy: Callable[..., Path], tmp_path: Path, rewrite_contract: Callable[..., None]
-) -> None:
-    folder = box_policy(tmp_path)
+def test_an_overshoot_of_rounding_is_clipped(tmp_path: Path) -> None:
+    folder = write_box_policy(tmp_path)
     space = read_contract(folder).action_space
     tighter = tuple(bound * (1 - 4e-6) for bound in space.high)  # type: ignore[union-attr]
     rewrite_contract(folder, action_space=space.model_copy(update={"high": tighter, "low": tuple(-b for b in tighter)}))
@@ -194,8 +184,8 @@ def test_an_overshoot_of_rounding_is_clipped(
     assert (np.abs(action) == np.array(tighter, np.float32)).any()
 
 
-def test_golden_vectors_that_do_not_reproduce_refuse_the_load(box_policy: Callable[..., Path], tmp_path: Path) -> None:
-    folder = box_policy(tmp_path)
+def test_golden_vectors_that_do_not_reproduce_refuse_the_load(tmp_path: Path) -> None:
+    folder = write_box_policy(tmp_path)
     inputs, outputs = (bundle := load_bundle(folder)).golden()
     outputs["action"][3, 2] += 0.01
     write_golden(folder, inputs, outputs)
@@ -230,10 +220,8 @@ def test_a_tampered_truncated_or_corrupt_bundle_is_refused(tmp_path: Path, ur5: 
         Policy.load(tmp_path / "nowhere")
 
 
-def test_a_contract_the_runtime_cannot_honour_is_refused(
-    box_policy: Callable[..., Path], tmp_path: Path, rewrite_contract: Callable[..., None]
-) -> None:
-    folder = box_policy(tmp_path)
+def test_a_contract_the_runtime_cannot_honour_is_refused(tmp_path: Path) -> None:
+    folder = write_box_policy(tmp_path)
     good = read_contract(folder)
     narrow = good.observation_space.model_copy(update={"shape": (26,), "elements": ()})
     double = good.observation_space.model_copy(update={"dtype": "float64"})
@@ -296,9 +284,9 @@ def test_loading_a_policy_starts_no_telemetry(ur5: Path, tmp_path: Path) -> None
     ],
 )
 def test_a_contract_with_numbers_that_cannot_be_is_refused(
-    box_policy: Callable[..., Path], tmp_path: Path, field: str, value: object, words: str
+    tmp_path: Path, field: str, value: object, words: str
 ) -> None:
-    folder = box_policy(tmp_path)
+    folder = write_box_policy(tmp_path)
     document = json.loads((folder / "contract.json").read_text())
     *path, last = field.split(".")
     inside = document
@@ -314,9 +302,7 @@ def test_a_contract_with_numbers_that_cannot_be_is_refused(
 
 
 @pytest.mark.parametrize("ragged", [[[0.0] * 27, [0.0] * 26], [[0.0] * 27, 1.0]])
-def test_a_ragged_batch_is_refused_in_our_own_words(
-    box_policy: Callable[..., Path], tmp_path: Path, ragged: list[object]
-) -> None:
+def test_a_ragged_batch_is_refused_in_our_own_words(tmp_path: Path, ragged: list[object]) -> None:
     with pytest.raises(ObservationError, match="observation 1 of the batch") as caught:
-        Policy.load(box_policy(tmp_path)).act(ragged)
+        Policy.load(write_box_policy(tmp_path)).act(ragged)
     assert "array" not in caught.value.message and "inhomogeneous" not in caught.value.message

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from rlservo.recording.recorder import Recorder
 from rlservo.recording.replay.replay import replay
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import over_uvicorn
 from stores import control_of, load_store
 
 
@@ -62,9 +62,9 @@ def environment() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def url(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[str]:
+def url(policies: Path) -> Iterator[str]:
     store = load_store(policies)
-    with served(create_app(control_of(store), ServerSettings())) as port:
+    with over_uvicorn(create_app(control_of(store), ServerSettings())) as port:
         yield f"http://127.0.0.1:{port}"
     store.close()
 
@@ -193,7 +193,6 @@ def test_commands_reach_the_policy_through_a_recording(ur5: Path, tmp_path: Path
 @pytest.mark.parametrize("wraps", [False, True], ids=["records itself", "is wrapped"])
 def test_server_gets_the_commanded_action_of_a_recorded_client(
     policies: Path,
-    served: Callable[[Any], AbstractContextManager[int]],
     tmp_path: Path,
     kind: type[PolicyClient | StreamClient],
     wraps: bool,
@@ -201,7 +200,7 @@ def test_server_gets_the_commanded_action_of_a_recorded_client(
     """The server limits the step from the last action: what comes next is at most that far from the commanded one."""
     store = load_store(policies, options={"ur5": PolicyOptions(max_action_step=0.01)})
     commanded = np.full(6, 0.9, np.float32)
-    with served(create_app(control_of(store), ServerSettings())) as port:
+    with over_uvicorn(create_app(control_of(store), ServerSettings())) as port:
         url = f"http://127.0.0.1:{port}"
         record = tmp_path / "run.mcap"
         with WithRecording(kind(url, "ur5"), record) if wraps else kind(url, "ur5", record=record) as policy:

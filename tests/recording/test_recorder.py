@@ -12,7 +12,6 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from bundles import write_box_policy
 from command_line import rlservo_here
 from rlservo.bundle.contract import Distribution
 from rlservo.bundle.log_probability import log_probability
@@ -30,6 +30,7 @@ from rlservo.errors import UsageError
 from rlservo.policy.policy import Policy
 from rlservo.recording import recorder as recorder_module
 from rlservo.recording.episodes import RecordedEpisode, episodes
+from rlservo.recording.log_file import LogFile
 from rlservo.recording.reader import Recording, RecordingError
 from rlservo.recording.recorded_policy import WithRecording
 from rlservo.recording.recorder import MIB, Recorder
@@ -389,6 +390,15 @@ def test_two_writers_of_one_folder_do_not_meet(ur5: Path, tmp_path: Path) -> Non
     assert sorted((episode.id, len(episode)) for episode in episodes(Recording(tmp_path))) == [("one", 10), ("two", 10)]
 
 
+def test_file_is_a_recording_from_its_start(tmp_path: Path) -> None:
+    """Whatever the size of Python's buffers: 128 KiB from 3.14 on."""
+    file = LogFile(tmp_path / "one.mcap")
+    try:
+        assert list(episodes(Recording(file.path))) == []
+    finally:
+        file.close()
+
+
 def test_file_being_written_is_not_deleted_by_another_writer(ur5: Path, tmp_path: Path) -> None:
     contract = Policy.load(ur5).contract
 
@@ -566,11 +576,11 @@ def test_a_file_that_the_recorder_deletes_meanwhile_is_left_out(ur5: Path, tmp_p
 
 
 def test_a_simulated_episode_is_as_long_as_its_steps_and_numbered_as_in_an_export(
-    ur5: Path, box_policy: Callable[..., Path], tmp_path: Path, rng: Rng
+    ur5: Path, tmp_path: Path, rng: Rng
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     with Recorder(tmp_path / "run.mcap") as recorder:
-        other = WithRecording(Policy.load(box_policy(tmp_path / "other", name="other")), recorder)
+        other = WithRecording(Policy.load(write_box_policy(tmp_path / "other", name="other")), recorder)
         policy = WithRecording(Policy.load(ur5), recorder)
         for acting, steps in ((policy, 31), (other, 7), (policy, 11)):
             record_episode(acting, rng, steps)

@@ -146,15 +146,19 @@ def without(key: str, side: Side) -> Side:
 
 OPEN = {
     "axis": (
-        r"does not say of its observation the order of the quaternion that element 15 \(target_qw\) is in; the robot's "
+        r"its observation does not state the order of the quaternion that element 15 \(target_qw\) is in; the robot's "
         r"is w, x, y, z: export it again, .* or with --convention quaternion=",
         {"quaternion": "wxyz"},
     ),
     "frame": (
-        r"of its observation the frame of element 12 \(target_x\); the robot's is base_link: .* --convention frame=",
+        r"its observation does not state the frame of element 12 \(target_x\); the robot's is base_link: .*"
+        "--convention frame=",
         {"frame": "base_link"},
     ),
-    "quantity": (r"of its action which command element 0 .* is; the robot takes a joint position: .*action=", None),
+    "quantity": (
+        r"its action does not state which command element 0 .* is; the robot takes a joint position: .*action=",
+        None,
+    ),
 }
 
 
@@ -175,7 +179,7 @@ def test_policy_without_any_name_drives_the_simulator_and_no_arm(
 ) -> None:
     bundle = exported([], [])
     assert drive(bundle, None).steps > 0
-    refused(bundle, ur10, "does not say of its observation")
+    refused(bundle, ur10, "its observation does not state")
 
 
 def test_same_conventions_come_to_the_next_question(ur10: RunningArm, exported: Callable[[Side, Side], Path]) -> None:

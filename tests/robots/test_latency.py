@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import threading
 import time
 from typing import Any
 
 import pytest
 
 from arms import RunningArm
+from command_line import rlservo
 from rlservo.robots.arm_interface import RobotError
 from rlservo.robots.arm_process import ArmProcess
 from rlservo.robots.latency import measure_latency
@@ -33,6 +36,28 @@ def test_latency_is_the_links_and_the_followers_and_gives_the_evaluation_to_pass
     assert report.disturbance == f"latency={report.cycles},noise=real"
     assert report.state_period_ms >= 7.9
     assert abs(arm.controller.simulation.joint_positions[5]) < 0.02
+
+
+def test_what_was_measured_is_told_although_a_stop_ended_the_hours(arm: RunningArm) -> None:
+    """A delay that ends the program is what one looks for in hours."""
+    arm.controller.trace.clear()
+    began = threading.Event()
+
+    def stop_it() -> None:
+        arm.wait_until(lambda: sum(abs(one.velocities[5]) > 0.1 for one in list(arm.controller.trace)) > 400)
+        began.set()
+        arm.do(lambda: arm.controller.stop_protectively("a test"))
+
+    person = threading.Thread(target=stop_it)
+    person.start()
+    words = ("--ur-model", "ur5", "--steps", "5", "--hours", "1", "--limit", "watchdog_hz=1", "--yes", "--json")
+    done = rlservo("robot-latency", f"rtde://{arm.host}", *words)
+    person.join()
+    assert done.returncode == 2 and began.is_set()
+    report = json.loads(done.stdout)
+    assert "protective_stop" in report["fault"] and report["steps"] >= 5
+    assert sum(report["latencies"]["counts"]) == report["steps"] and sum(report["periods"]["counts"]) > 100
+    assert f"ended after {report['steps']} motions: the robot stopped: protective_stop" in done.stderr
 
 
 def test_motion_that_was_cut_short_is_followed_by_a_whole_one(arm: RunningArm) -> None:

@@ -17,6 +17,7 @@ import httpx
 import numpy as np
 import pytest
 
+from grpc_calls import infer_request
 from rlservo.client.policy_client import PolicyClient
 from rlservo.client.stream_client import StreamClient
 from rlservo.errors import UnavailableError
@@ -133,12 +134,11 @@ def test_clients_act_below_a_prefix(trusted: Behind, ur5: Path) -> None:
 
 def test_grpc_acts_through_tls_as_in_process(trusted: Behind, ur5: Path) -> None:
     credentials = grpc.ssl_channel_credentials(trusted.authority.read_bytes())
-    asked = messages.ModelInferRequest(model_name="ur5")
-    asked.inputs.add(name="obs", datatype="FP32", shape=(1, 27))
-    asked.raw_input_contents.append(OBS.tobytes())
     with grpc.secure_channel(f"localhost:{trusted.port}", credentials) as channel:
         infer = channel.unary_unary("/inference.GRPCInferenceService/ModelInfer")
-        content = infer(asked.SerializeToString(), metadata=(("authorization", f"Bearer {trusted.key}"),), timeout=60)
+        content = infer(
+            infer_request([OBS]).SerializeToString(), metadata=(("authorization", f"Bearer {trusted.key}"),), timeout=60
+        )
     reply = messages.ModelInferResponse.FromString(content)
     with Policy.load(ur5) as policy:
         assert reply.raw_output_contents[0] == policy.act(OBS).tobytes()

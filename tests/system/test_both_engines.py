@@ -17,6 +17,7 @@ import grpc
 import numpy as np
 import pytest
 
+from bundles import write_slow_policy
 from clusters import KEY, Cluster
 from loads import Load, busiest
 from rlservo.client.policy_client import PolicyClient
@@ -231,6 +232,16 @@ def test_no_request_fails_while_the_production_version_changes_on_a_cluster(clus
         following[shown["replica"]] = shown["generation"]
 
 
+def test_what_answers_on_a_cluster_does_not_give_way_to_other_programs(cluster: Cluster) -> None:
+    answering = {"ServeReplica", "HAProxyManager", "haproxy"}
+    found: dict[str, set[int]] = {}
+    for process in cluster.root.children(recursive=True):
+        for name in answering:
+            if name in process.name() or any(name in word for word in process.cmdline()[:1]):
+                found.setdefault(name, set()).add(process.nice())
+    assert found == {name: {cluster.root.nice()} for name in answering}
+
+
 def test_a_replica_that_is_killed_is_replaced_and_its_clients_ask_another(cluster: Cluster, load: Load) -> None:
     before = cluster.replica_pids()
     assert len(before) == 2
@@ -246,10 +257,8 @@ def test_a_replica_that_is_killed_is_replaced_and_its_clients_ask_another(cluste
     assert load.asked > 50 and (load.wrong, load.failures) == (0, [])
 
 
-def test_a_replica_that_dies_is_logged_by_its_successor_with_the_version_it_was_computing(
-    cluster: Cluster, slow_policy: Callable[..., Path]
-) -> None:
-    action = Policy.load(slow_policy(cluster.repository, version="9")).act(OBS)
+def test_a_replica_that_dies_is_logged_by_its_successor_with_the_version_it_was_computing(cluster: Cluster) -> None:
+    action = Policy.load(write_slow_policy(cluster.repository, version="9")).act(OBS)
     load = Load(cluster.port, "ur5", OBS.tolist(), [np.asarray(action)], api_key=KEY, pause_s=0.0, version="9")
 
     def logged() -> set[str]:

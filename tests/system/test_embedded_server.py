@@ -13,13 +13,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
+from bundles import write_box_policy, write_slow_policy
 from loads import CLIENTS, Load, busiest
 from rlservo.errors import BundleError, UsageError
 from rlservo.policy.policy import Policy
@@ -194,6 +195,20 @@ def test_sighup_replaces_every_worker_and_no_request_fails(workers: tuple[Run, L
     assert load.asked > 100 and (load.wrong, load.failures) == (0, [])
 
 
+@contextlib.contextmanager
+def two_workers_of(program: str, policies: Path, folder: Path) -> Iterator[tuple[Run, list[str]]]:
+    """A server, ready, of a program that changes a part of it, and the lines it has printed so far."""
+    script = folder / "serve.py"
+    script.write_text(program)
+    (port,) = free_ports(1)
+    command = [sys.executable, str(script), "serve", str(policies), "--port", str(port), "--workers", "2"]
+    with running(command, port) as run:
+        lines: list[str] = []
+        threading.Thread(target=lines.extend, args=(run.process.stdout,), daemon=True).start()
+        wait_for(lambda: any(line.startswith("ready") for line in lines), "the line that it is ready")
+        yield run, lines
+
+
 # uvicorn 0.54 makes a worker's server twice if its two threads come to it at once; the one that it asks whether it has
 # started is then not the one that runs, here every time.
 ASKED_THE_WRONG_ONE = """
@@ -212,24 +227,41 @@ if __name__ == "__main__":
 @pytest.mark.serve
 @pytest.mark.slow
 def test_workers_say_themselves_that_they_have_started(policies: Path, tmp_path: Path) -> None:
-    script = tmp_path / "serve.py"
-    script.write_text(ASKED_THE_WRONG_ONE)
-    (port,) = free_ports(1)
-    command = [sys.executable, str(script), "serve", str(policies), "--port", str(port), "--workers", "2"]
-    with running(command, port) as run:
-        lines: list[str] = []
-        threading.Thread(target=lines.extend, args=(run.process.stdout,), daemon=True).start()
-        wait_for(lambda: any(line.startswith("ready") for line in lines), "the line that it is ready")
+    with two_workers_of(ASKED_THE_WRONG_ONE, policies, tmp_path) as (run, _lines):
         before = worker_pids(run)
         run.process.send_signal(signal.SIGHUP)
         wait_for(lambda: not set(before) & set(now := worker_pids(run)) and len(now) == 2, "new workers", poll_s=0.2)
         assert run.end(signal.SIGTERM) == 0
 
 
+# A worker's imports take longer than a worker that serves may be silent, as on a starved machine.
+STARTS_SLOWLY = """
+import time
+from rlservo.serve_app.engines import uvicorn_server
+
+uvicorn_server.HUNG_S = 6
+
+if __name__ == "__main__":
+    from rlservo.deploy.cli import main
+
+    main()
+else:
+    time.sleep(12)
+"""
+
+
 @pytest.mark.serve
 @pytest.mark.slow
-def test_sighup_keeps_workers_that_new_ones_cannot_replace(box_policy: Callable[..., Path], tmp_path: Path) -> None:
-    box_policy(tmp_path / "policies")
+def test_workers_that_take_long_to_start_are_not_taken_for_hung(policies: Path, tmp_path: Path) -> None:
+    with two_workers_of(STARTS_SLOWLY, policies, tmp_path) as (run, lines):
+        assert not [line for line in lines if "did not answer" in line]
+        assert run.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+def test_sighup_keeps_workers_that_new_ones_cannot_replace(tmp_path: Path) -> None:
+    write_box_policy(tmp_path / "policies")
     with launched(tmp_path / "policies", workers=2) as run:
         run.wait_until_ready()
         before = worker_pids(run)
@@ -238,6 +270,29 @@ def test_sighup_keeps_workers_that_new_ones_cannot_replace(box_policy: Callable[
         wait_for(lambda: "could not start: worker" in "".join(run.output), "the sentence that it stays")
         assert worker_pids(run) == before
         assert ask(run.port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200
+        assert run.end(signal.SIGTERM) == 0
+
+
+@pytest.mark.serve
+@pytest.mark.slow
+@pytest.mark.parametrize("lost", ["policies", "plan"])  # a worker that began another plan would serve other versions
+def test_workers_keep_serving_when_one_cannot_start_again_and_it_is_tried_until_it_can(
+    tmp_path: Path, lost: str
+) -> None:
+    write_box_policy(tmp_path / "policies")
+    with launched(tmp_path / "policies", workers=2, RLSERVO_PLAN=str(tmp_path / "plan")) as run:
+        run.wait_until_ready()
+        dies, stays = worker_pids(run)
+        (tmp_path / lost).rename(tmp_path / "away")
+        os.kill(dies, signal.SIGKILL)
+        wait_for(lambda: "cannot replace another: 1 keep serving" in "".join(run.output), "the sentence on it")
+        assert worker_pids(run) == [stays]
+        assert ask(run.port, "POST", "/v1/policies/ur5/act", {"obs": OBS})[0] == 200
+        assert lost == "policies" or "has lost the plan that this server follows" in "".join(run.output)
+        (tmp_path / "away").rename(tmp_path / lost)
+        wait_for(lambda: len(worker_pids(run)) == 2, "the second worker")
+        wait_for(lambda: ask(run.port, "GET", "/metrics")[1].count(b"rlservo_plan_generation{") == 2, "both to serve")
+        assert run.process.poll() is None and stays in worker_pids(run)
         assert run.end(signal.SIGTERM) == 0
 
 
@@ -290,10 +345,8 @@ def test_a_server_with_stopped_workers_ends_as_one_without(policies: Path, waite
 
 @pytest.mark.serve
 @pytest.mark.slow
-def test_a_worker_that_dies_is_logged_with_the_signal_and_the_version_it_was_computing(
-    slow_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    slow, log = slow_policy(tmp_path / "policies", version="3"), tmp_path / "server.log"
+def test_a_worker_that_dies_is_logged_with_the_signal_and_the_version_it_was_computing(tmp_path: Path) -> None:
+    slow, log = write_slow_policy(tmp_path / "policies", version="3"), tmp_path / "server.log"
 
     def deaths() -> list[str]:
         lines = map(json.loads, log.read_text().splitlines())

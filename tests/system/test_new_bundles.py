@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
+from bundles import write_box_policy, write_discrete_policy
 from servers import ask, free_ports, running, wait_until_served
 from waiting import wait_for
 
@@ -45,16 +46,14 @@ def rlservo(runtime: Path, *words: str) -> str:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_start_names_what_it_does_not_serve_and_the_command_that_loads_it(
-    box_policy: Callable[..., Path], discrete_policy: Callable[..., Path], tmp_path: Path, workers: int
-) -> None:
+def test_a_start_names_what_it_does_not_serve_and_the_command_that_loads_it(tmp_path: Path, workers: int) -> None:
     root, runtime = tmp_path / "policies", tmp_path / "runtime"
     runtime.mkdir()
-    box_policy(root, version="1")
+    write_box_policy(root, version="1")
     with serving(root, runtime, workers) as (_, lines):
         assert "not served" not in "".join(lines)
-    box_policy(root, version="2", seed=1)
-    discrete_policy(root)
+    write_box_policy(root, version="2", seed=1)
+    write_discrete_policy(root)
     with serving(root, runtime, workers) as (port, lines):
         said = "".join(lines)
         url = ("--url", f"http://127.0.0.1:{port}")

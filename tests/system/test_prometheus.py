@@ -11,8 +11,8 @@ import signal
 import subprocess
 import time
 import urllib.parse
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import yaml
 
+from bundles import write_box_policy
 from rlservo.bundle import bundle as bundle_files
 from rlservo.bundle.contract import BakedStep
 from rlservo.client.stream_client import StreamClient
@@ -27,7 +28,7 @@ from rlservo.errors import RlservoError
 from rlservo.policy.drift import EVERY
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
-from servers import ROOT, LiveServer, ask, free_ports, launched
+from servers import ROOT, LiveServer, ask, free_ports, launched, over_uvicorn
 from stores import control_of, load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -84,19 +85,15 @@ def test_the_rules_name_codes_that_there_are() -> None:
 
 
 @pytest.fixture(scope="module")
-def drifting(
-    box_policy: Callable[..., Path],
-    served: Callable[[Any], AbstractContextManager[int]],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[int]:
+def drifting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """The port of a server in this process, whose policy was asked for what it was not trained on."""
-    folder = box_policy(tmp_path_factory.mktemp("filtered"))
+    folder = write_box_policy(tmp_path_factory.mktemp("filtered"))
     contract = bundle_files.read_contract(folder)
     still = {"count": 9000, "mean": [0.0] * 27, "std": [1.0] * 27, "clip": None, "demean": True, "destd": True}
     steps = (BakedStep(step="mean_std_filter", values=still), *contract.baked_in[1:])
     bundle_files.write_contract(folder, contract.model_copy(update={"baked_in": steps}))
     store = load_store(folder)
-    with served(create_app(control_of(store), ServerSettings(), replica="drifting")) as port:
+    with over_uvicorn(create_app(control_of(store), ServerSettings(), replica="drifting")) as port:
         for _ in range(3 * EVERY):
             assert ask(port, "POST", "/v1/policies/ur5/act", {"obs": [4.0] * 27})[0] == 200
         yield port

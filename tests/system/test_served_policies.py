@@ -37,19 +37,14 @@ def test_the_operator_administers_with_the_key_that_serve_wrote(shipped_server: 
     assert "ur5: default 1, loaded 1; aliases production=1" in done.stdout
 
 
-@pytest.mark.parametrize(("name", "env_id", "seed", "rate"), [
-    ("ur5", UR5, 31_000, 0.95), ("mir100", MIR100, 32_000, 0.98),
-])  # fmt: skip
-def test_random_targets_are_reached(
-    shipped_server: ShippedServer, shipped: Path, name: str, env_id: str, seed: int, rate: float
+@pytest.mark.parametrize(("name", "env_id", "seed"), [("ur5", UR5, 31_000), ("mir100", MIR100, 32_000)])
+def test_random_targets_are_reached_over_http_as_in_process(
+    shipped_server: ShippedServer, shipped: Path, name: str, env_id: str, seed: int
 ) -> None:
-    """100 episodes in process; the first 20 of them over HTTP, which are the same step for step."""
-    with Policy.load(shipped / name) as policy:
-        local = rollout(policy, env_id, episodes=100, seed=seed)
-    assert local.success_rate is not None and local.success_rate >= rate, local.final_status
-    with PolicyClient(shipped_server.url, name) as client:
-        served = rollout(client, env_id, episodes=20, seed=seed)
-    for over_http, in_process in zip(served.episodes, local.episodes[:20], strict=True):
+    with Policy.load(shipped / name) as policy, PolicyClient(shipped_server.url, name) as client:
+        local, served = (rollout(acting, env_id, episodes=20, seed=seed) for acting in (policy, client))
+    assert local.successes is not None and local.successes >= 15  # the rate itself: test_shipped_policies.py
+    for over_http, in_process in zip(served.episodes, local.episodes, strict=True):
         assert (over_http.seed, over_http.steps) == (in_process.seed, in_process.steps)
         assert (over_http.success, over_http.final_status) == (in_process.success, in_process.final_status)
         assert over_http.episode_return == pytest.approx(in_process.episode_return, rel=1e-6)
@@ -63,7 +58,7 @@ def test_returns_are_the_rllib_checkpoints_own(
 ) -> None:
     bundle = shutil.copytree(shipped / name, tmp_path / name)  # the evaluation is written into it
     done = rlservo_here(
-        "verify", bundle, "--checkpoint", CHECKPOINTS / checkpoint, "--env", env_id, "--episodes", 10,
+        "verify", bundle, "--checkpoint", CHECKPOINTS / checkpoint, "--env", env_id, "--episodes", 4,
         "--seed", 33_000, "--json",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

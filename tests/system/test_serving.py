@@ -1,45 +1,33 @@
-"""The embedded server in a process of its own: replies and loaded modules."""
+"""The embedded server in a process of its own: a large request, and the modules it loads."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rlservo.policy.policy import Policy
-from servers import LiveServer, ask
+from servers import LiveServer, exchange
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
 
-ROOT = Path(__file__).resolve().parents[2]
-OBS = [round(0.01 * i, 2) for i in range(27)]
+BATCH = np.random.default_rng(3).standard_normal((1024, 27)).astype(np.float32)
 
 
-def test_the_served_action_is_the_policys_own(live_server: LiveServer, policies: Path) -> None:
-    status, reply = ask(live_server.port, "POST", "/v1/policies/ur5/act", {"obs": OBS, "seq": 3}, key=live_server.key)
-    assert (status, reply["version"], reply["seq"]) == (200, "10", 3)
-    np.testing.assert_allclose(reply["action"], Policy.load(policies / "ur5" / "10").act(OBS), rtol=1e-6)
-    assert ask(live_server.port, "POST", "/v1/policies/gridworld/act", {"obs": 1}, key=live_server.key)[0] == 200
-
-
-def test_errors_are_told_and_the_server_goes_on(live_server: LiveServer) -> None:
-    cases = [
-        ("/v1/policies/ur5/act", {"obs": OBS[:26]}, 422, "bad-observation"),
-        ("/v1/policies/ur5/act", b'{"obs": [NaN]}', 422, "bad-observation"),
-        ("/v1/policies/ur5/act", b"{", 400, "bad-request"),
-        ("/v1/policies/ur6/act", {"obs": OBS}, 404, "unknown-policy"),
-        ("/v1/policies/ur5/act", {"obs": OBS, "deadline_ms": 0}, 408, "deadline-passed"),
-    ]
-    for path, body, status, code in cases * 5:
-        got, reply = ask(live_server.port, "POST", path, body, key=live_server.key)
-        assert (got, reply["code"]) == (status, code)
-    assert ask(live_server.port, "POST", "/v1/policies/ur5/act", {"obs": OBS}, key=live_server.key)[0] == 200
-
-
-def test_health_is_served(live_server: LiveServer) -> None:
-    assert ask(live_server.port, "GET", "/v2/health/ready") == (200, {"ready": True})
-    assert ask(live_server.port, "GET", "/healthz") == (200, b"OK")
+def test_a_batch_of_1024_goes_through_as_binary_tensors(live_server: LiveServer, ur5: Path) -> None:
+    tensor = {"name": "obs", "shape": [1024, 27], "datatype": "FP32", "parameters": {"binary_data_size": BATCH.nbytes}}
+    header = json.dumps({"inputs": [tensor], "parameters": {"binary_data_output": True}}).encode()
+    status, headers, reply = exchange(
+        live_server.port, "POST", "/v2/models/ur5/infer", header + BATCH.tobytes(),
+        authorization=live_server.bearer, content_type="application/octet-stream",
+        inference_header_content_length=str(len(header)),
+    )  # fmt: skip
+    assert status == 200
+    action = np.frombuffer(reply[int(headers["inference-header-content-length"]) :], "<f4").reshape(1024, 6)
+    with Policy.load(ur5) as policy:
+        np.testing.assert_allclose(action, policy.act(BATCH), rtol=1e-6)
 
 
 def test_the_server_loads_nothing_that_it_does_not_need(live_server: LiveServer) -> None:

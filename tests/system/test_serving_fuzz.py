@@ -21,10 +21,12 @@ from typing import Any
 
 import grpc
 import msgpack
+import numpy as np
 import pytest
 import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
+from grpc_calls import infer_request
 from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -203,11 +205,11 @@ def test_broken_websocket_frames_end_their_connection_only(live_server: Any) -> 
 
 
 def grpc_messages(rng: random.Random) -> Iterator[bytes]:
-    asked = messages.ModelInferRequest(model_name="ur5", id="f", raw_input_contents=[bytes(108)])
-    asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
-    asked.parameters["seed"].int64_param = 3
+    asked = infer_request(np.zeros((1, 27)), seed=3)
     typed = messages.ModelInferRequest(model_name="ur5")
     typed.inputs.add(name="obs", datatype="FP32", shape=[1, 27]).contents.fp32_contents.extend([0.5] * 27)
+    for name in ("", "ur6", "\0"):
+        yield messages.ModelInferRequest(model_name=name).SerializeToString()
     for shape in ([2**31, 2**31], [-1, 27], [0, 27], [1] * 40):
         wrong = messages.ModelInferRequest()
         wrong.CopyFrom(typed)

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,15 +13,19 @@ from typing import Any
 import grpc
 import numpy as np
 import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from grpc_calls import answered, infer_request
 from rlservo.errors import UsageError
 from rlservo.policy.policy import Policy
 from rlservo.recording.episodes import episodes
 from rlservo.recording.reader import Recording
 from rlservo.serve_app.engines.uvicorn_server import serve_policies
-from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc, is_local
+from rlservo.serve_app.protocols.open_inference.grpc_service import is_local
 from rlservo.serve_app.protocols.open_inference.oip_messages import messages
-from servers import free_ports, launched
+from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.server.settings import ServerSettings
+from servers import free_ports
 from stores import control_of, load_store
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -51,9 +53,7 @@ def call(live_server: Any) -> Iterator[Call]:
 
 
 def test_what_grpc_decides_is_recorded(live_server: Any, call: Call, ur5: Path) -> None:
-    asked = request(OBS[:1], id="recorded-1")
-    asked.raw_input_contents.append(OBS[:1].tobytes())
-    asked.parameters["sequence_id"].string_param = "recorded-arm"
+    asked = infer_request(OBS[:1], sequence_id="recorded-arm")
     reply = call("ModelInfer", asked, messages.ModelInferResponse)
     deadline, mine = time.monotonic() + 20, []
     while not mine and time.monotonic() < deadline:  # written within a second
@@ -69,8 +69,7 @@ def test_what_grpc_decides_is_recorded(live_server: Any, call: Call, ur5: Path) 
 
 @pytest.mark.parametrize("place", ["input", "output"])
 def test_parameters_of_tensors_and_outputs_are_bounded(call: Call, place: str) -> None:
-    asked = request(OBS[:1])
-    asked.raw_input_contents.append(OBS[:1].tobytes())
+    asked = infer_request(OBS[:1])
     of = asked.inputs[0] if place == "input" else asked.outputs.add(name="action")
     for number in range(50_000):
         of.parameters[f"{number}"].bool_param = True
@@ -201,35 +200,9 @@ def test_bytes_that_are_no_message_are_a_bad_request(call: Call) -> None:
 
 
 def test_a_deadline_that_has_passed_is_not_worked_for(ur5: Path) -> None:
-    from rlservo.serve_app.server.request_handler import RequestHandler
-    from rlservo.serve_app.server.settings import ServerSettings
-
-    store = load_store(ur5)
-    asked = request(OBS)
-    asked.raw_input_contents.append(OBS.tobytes())
-
-    class Context:
-        def __init__(self) -> None:
-            self.status: list[Any] = []
-
-        def invocation_metadata(self) -> list[Any]:
-            return []
-
-        def set_code(self, code: Any) -> None:
-            self.status.append(code)
-
-        set_details = set_trailing_metadata = lambda self, _value: None
-
-    import asyncio
-
-    async def ask(remaining: float | None) -> list[Any]:
-        context = Context()
-        service = Grpc(RequestHandler(control_of(store), ServerSettings()))
-        await service.answer("ModelInfer", asked.SerializeToString(), context, remaining)
-        return context.status
-
-    assert asyncio.run(ask(0.0)) == [grpc.StatusCode.DEADLINE_EXCEEDED]
-    assert asyncio.run(ask(5.0)) == asyncio.run(ask(None)) == []
+    handler = RequestHandler(control_of(load_store(ur5)), ServerSettings())
+    statuses = [answered(handler, infer_request(OBS), remaining_s=left)[1].code for left in (0.0, 5.0, None)]
+    assert statuses == [grpc.StatusCode.DEADLINE_EXCEEDED, None, None]
 
 
 def test_a_key_is_needed_for_all_but_health(live_server: Any) -> None:
@@ -289,26 +262,9 @@ def test_a_taken_grpc_port_is_said_before_anything_starts(policies: Path) -> Non
         serve_policies([policies], port=port, grpc_port=taken.getsockname()[1])
 
 
-def test_messages_leave_the_process_wide_pool_alone() -> None:
-    """KServe's and Triton's packages register `inference.*` there."""
-    code = (
-        "import rlservo.serve_app.protocols.open_inference.oip_messages\n"
-        "from google.protobuf import descriptor_pool\n"
-        "try: descriptor_pool.Default().FindMessageTypeByName('inference.ModelInferRequest')\n"
-        "except KeyError: print('free')"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert done.stdout.strip() == "free", done.stderr
-
-
-def test_health_is_told_without_a_key(policies: Path) -> None:
-    from grpc_health.v1 import health_pb2, health_pb2_grpc
-
-    with launched(policies, with_grpc=True) as run:
-        run.wait_until_ready()
-        with grpc.insecure_channel(f"127.0.0.1:{run.grpc_port}") as channel:
-            for service in ("", "inference.GRPCInferenceService"):
-                request = health_pb2.HealthCheckRequest(service=service)
-                reply = health_pb2_grpc.HealthStub(channel).Check(request, timeout=20)
-                assert reply.status == health_pb2.HealthCheckResponse.SERVING
-        assert run.end(signal.SIGTERM) == 0
+def test_health_is_told_without_a_key(live_server: Any) -> None:
+    with grpc.insecure_channel(f"127.0.0.1:{live_server.grpc_port}") as channel:
+        for service in ("", "inference.GRPCInferenceService"):
+            request = health_pb2.HealthCheckRequest(service=service)
+            reply = health_pb2_grpc.HealthStub(channel).Check(request, timeout=20)
+            assert reply.status == health_pb2.HealthCheckResponse.SERVING

@@ -18,9 +18,9 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper
 
-from bundles import PARITY, PROVENANCE, save_graph
+from bundles import contract_of, save_graph
 from rlservo.bundle import bundle as bundle_files
-from rlservo.bundle.contract import Contract, TensorSpec
+from rlservo.bundle.contract import TensorSpec
 from rlservo.bundle.spaces import BoxSpec, DictSpec, Element, Quantity
 from rlservo.client.admin_client import AdminClient
 from rlservo.client.policy_client import PolicyClient
@@ -78,24 +78,14 @@ def arm(
     }  # fmt: skip
     if camera:
         spaces["camera"] = BoxSpec(shape=(4,), dtype="float32", low=0.0, high=1.0)
-    contract = Contract(
-        name="arm",
+    acted = tuple(each.model_copy(update={"quantity": command}) for each in elements) if actions == 3 else ()
+    contract = contract_of(
+        "arm",
+        DictSpec(spaces=spaces),
+        BoxSpec(shape=(actions,), dtype="float32", low=-high, high=high, elements=acted),
         version=version,
-        observation_space=DictSpec(spaces=spaces),
-        action_space=BoxSpec(
-            shape=(actions,),
-            dtype="float32",
-            low=-high,
-            high=high,
-            elements=tuple(each.model_copy(update={"quantity": command}) for each in elements) if actions == 3 else (),
-        ),
         inputs=tuple(TensorSpec(name=f"obs.{name}", dtype=kind, shape=(-1, n)) for name, (kind, n) in leaves.items()),
-        outputs=(TensorSpec(name="action", dtype="float32", shape=(-1, actions)),),
-        distribution=None,
-        baked_in=(),
         control_rate_hz=rate_hz,
-        provenance=PROVENANCE,
-        parity=PARITY,
     )
     (folder / bundle_files.TORCHSCRIPT_FILE).write_bytes(b"no TorchScript: " + bytes(1000))
     golden = {f"obs.{name}": np.full((4, size), 0.5, kind) for name, (kind, size) in leaves.items()}

@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import grpc
-import msgpack
 import pytest
-import websockets.sync.client
 
+from grpc_calls import infer_request
 from rlservo import PolicyClient, StreamClient
 from rlservo.recording.episodes import episodes
 from rlservo.recording.reader import Recording
-from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from servers import Run, exchange, launched
+from streams import Stream
 from waiting import wait_for
 
 collector = pytest.importorskip("opentelemetry.proto.collector.trace.v1.trace_service_pb2")
@@ -67,12 +66,11 @@ def spans() -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def act_over_grpc(run: Run, trace: str) -> dict[str, Any]:
-    asked = messages.ModelInferRequest(model_name="ur5")
-    tensor = asked.inputs.add(name="obs", datatype="FP32", shape=[1, 27])
-    tensor.contents.fp32_contents.extend(OBS)
     with grpc.insecure_channel(f"127.0.0.1:{run.grpc_port}") as channel:
         stub = channel.unary_unary("/inference.GRPCInferenceService/ModelInfer")
-        _, call = stub.with_call(asked.SerializeToString(), metadata=[("traceparent", parent(trace))], timeout=20)
+        _, call = stub.with_call(
+            infer_request([OBS]).SerializeToString(), metadata=[("traceparent", parent(trace))], timeout=20
+        )
         return dict(call.trailing_metadata())
 
 
@@ -91,11 +89,8 @@ def test_a_request_is_followed_from_the_client_to_the_network(
         reply = exchange(run.port, "POST", ACT, {"obs": OBS, "seq": 7}, traceparent=parent(answered))
         assert (reply.status, dict(reply.headers)["traceparent"]) == (200, parent(answered))
         assert exchange(run.port, "POST", ACT, {"obs": [0.1]}, traceparent=parent(refused)).status == 422
-        ws = f"ws://127.0.0.1:{run.port}/v1/policies/ur5/stream"
-        with websockets.sync.client.connect(ws, additional_headers={"traceparent": parent(streamed)}) as stream:
-            stream.recv(timeout=20)  # metadata
-            stream.send(msgpack.packb({"obs": OBS}))
-            assert "actions" in msgpack.unpackb(stream.recv(timeout=20))
+        with Stream(run.port, "/v1/policies/ur5/stream", traceparent=parent(streamed)) as stream:
+            assert "actions" in stream.ask(obs=OBS)
         assert act_over_grpc(run, called)["traceparent"] == parent(called)
         for other in ("00-" + "0" * 32 + f"-{SPAN}-01", f"ff-{answered}-{SPAN}-01", "x", parent("b" * 32, "00")):
             reply = exchange(run.port, "POST", ACT, {"obs": OBS}, traceparent=other)

@@ -9,12 +9,12 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from bundles import write_box_policy
 from servers import Run, ask, free_ports, running, wait_until_served
 
 pytestmark = [pytest.mark.serve, pytest.mark.slow]
@@ -23,10 +23,10 @@ PATIENCE_S = 60
 
 
 @pytest.fixture(scope="module")
-def server(box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """Two workers; at the end nothing is left of them, no file either."""
     folder = tmp_path_factory.mktemp("policies")
-    box_policy(folder)
+    write_box_policy(folder)
     (port,) = free_ports(1)
     command = [sys.executable, "-m", "rlservo.deploy.cli", "serve", str(folder), "--workers", "2", "--port", str(port)]
     runtime = tmp_path_factory.mktemp("runtime")

@@ -3,7 +3,7 @@
 | origin | where |
 |---|---|
 | mjlab (and whole_body_tracking) | `metadata_props`: comma-separated lists, numbers with three decimals |
-| Isaac Lab | `IO_descriptors.yaml` |
+| Isaac Lab | `IO_descriptors.yaml`; the run's `env.yaml` |
 | Unitree's unitree_rl_lab | `deploy.yaml`: numbers with three digits, joints without names |
 | Microduck | `manifest.json` with `obs_len`, or `policies` |
 | physicalai, LeRobot | `manifest.json` with the format `policy_package` |
@@ -25,15 +25,26 @@ import numpy as np
 
 from rlservo.errors import CheckpointError, UnsupportedError
 from rlservo.export.checkpoints.facts import CheckpointFacts
-from rlservo.export.sources.isaac_env import KINDS, class_name, clip_actions, read_yaml
+from rlservo.export.sources.isaac_env import (
+    KINDS,
+    LIBRARIES,
+    action_terms,
+    class_name,
+    clip_actions,
+    read_yaml,
+    selected,
+)
+from rlservo.export.sources.isaac_observations import clip_note, clip_notes
 
 DESCRIPTORS = ("IO_descriptors.yaml", "io_descriptors/IO_descriptors.yaml", "../io_descriptors/IO_descriptors.yaml")
 DEPLOYS = ("deploy.yaml", "params/deploy.yaml", "../params/deploy.yaml")
+ENVIRONMENTS = ("params/env.yaml", "../params/env.yaml")
 AGENTS = ("params/agent.yaml", "../params/agent.yaml")
 """Places beside the file: of a run's `exported/policy.onnx`, the run's folder."""
 LENGTHS = {
     "default_joint_pos": "joint_names",
     "observation_terms_scale": "observation_names",
+    "observation_terms_clip": "observation_names",
     "observation_terms_history_length": "observation_names",
 }
 """Lists of mjlab's metadata, and those that name their entries."""
@@ -78,11 +89,13 @@ class Annotation:
     """Order of quaternions."""
     left_out: str = ""
     """A clause for what it says of the action that a scale and an offset do not express."""
+    notes: tuple[str, ...] = ()
+    """Warnings."""
 
 
 def annotation_files(model: Path) -> list[Path]:
     """Return the files beside a model that are read with it."""
-    names = (*DESCRIPTORS, "manifest.json", *DEPLOYS, *AGENTS)
+    names = (*ENVIRONMENTS, *DESCRIPTORS, "manifest.json", *DEPLOYS, *AGENTS)
     return [file for name in names if (file := model.parent / name).is_file()]
 
 
@@ -101,12 +114,11 @@ def read_annotations(
     are not in the graph.
     """
     found: list[tuple[str, Callable[[], Annotation]]] = []
-    if metadata.keys() & {"joint_names", "observation_names", "action_scale"}:
-        place = f"{model} (metadata_props)"
-        found.append((place, partial(_mjlab, place, metadata, size, joint_order)))
     for file in annotation_files(model):
         if file.name == "IO_descriptors.yaml":
-            found.append((str(file), partial(_descriptors, file)))
+            found.append((str(file), partial(_descriptors, file, joint_order)))
+        elif file.name == "env.yaml":
+            found.append((str(file), partial(_environment, file, size, joint_order)))
         elif file.name == "agent.yaml":
             continue
         elif file.name == "deploy.yaml":
@@ -115,15 +127,35 @@ def read_annotations(
             found.append((str(file), partial(_policy_package, file, manifest)))
         elif manifest.keys() & {"obs_len", "action_len", "policies", "schema_version"}:
             found.append((str(file), partial(_microduck, file, manifest, model)))
+    if metadata.keys() & {"joint_names", "observation_names", "action_scale"}:
+        place = f"{model} (metadata_props)"
+        found.append((place, partial(_mjlab, place, metadata, size, joint_order)))
     read: list[Annotation] = []
     for place, reader in found:
         try:
             read.append(reader())
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise CheckpointError(
                 f"{place} is not as its exporter writes it: {type(error).__name__}: {error}"
             ) from error
+    if sum(bool(each.scale) for each in read) == 1 and read[-1].scale and "action_scale" in metadata:
+        read[-1] = _with_rounding(read[-1], metadata["action_scale"])
     return read
+
+
+def _with_rounding(said: Annotation, scale: str) -> Annotation:
+    """Return the annotation with a warning of an action_scale of few digits. Raises CheckpointError if it is 0."""
+    rounded = [text for text in scale.split(",") if abs(float(text)) < 0.05 and re.fullmatch(r"-?\d*\.\d{1,3}", text)]
+    if 0.0 in map(float, scale.split(",")):
+        raise CheckpointError(
+            f"{said.place}: action_scale is {scale}, and a joint with 0 would never move: its exporter rounds to three "
+            "decimals; write the training's own numbers there, or lay the run's params/env.yaml beside"
+        )
+    if rounded:
+        off = max(0.0005 / abs(float(text)) for text in rounded)
+        note = f"action_scale is {scale}, rounded: the training's numbers may differ by {off:.0%}"
+        return replace(said, notes=(*said.notes, note))
+    return said
 
 
 def merged(annotations: Sequence[Annotation]) -> Annotation:
@@ -187,7 +219,10 @@ def _mjlab(place: str, metadata: Mapping[str, str], size: int, joint_order: Sequ
     """mjlab/rl/exporter_utils.py: lists with commas, lists in them with semicolons."""
 
     def names(key: str) -> list[str]:
-        return [name for name in metadata.get(key, "").split(",") if name]
+        listed = [name.strip() for name in metadata.get(key, "").split(",") if name]
+        if any(re.search(r"[\[\]{}'\"]", name) for name in listed):
+            raise ValueError(f"{key} is {metadata[key]!r}: expected entries with commas between")
+        return listed
 
     def numbers(key: str) -> list[float]:
         return [float(number) for number in names(key)]
@@ -198,7 +233,7 @@ def _mjlab(place: str, metadata: Mapping[str, str], size: int, joint_order: Sequ
         if count and expected and count != expected:
             raise CheckpointError(f"{place}: {names_key} has {expected} entries, {key} has {count}")
     joints = list(joint_order) or (robot if len(robot) == size else [])
-    if robot and not set(joints) <= set(robot):
+    if robot and [joint for joint in robot if joint in joints] != joints:
         raise CheckpointError(
             f"{place} has the joints {_text(tuple(robot))}, the joint order that was given is {_text(tuple(joints))}"
         )
@@ -209,7 +244,10 @@ def _mjlab(place: str, metadata: Mapping[str, str], size: int, joint_order: Sequ
         )
     clause = metadata.get("action_term") or metadata.get("action_type") or ""
     moved: dict[str, Any] = {}
-    if "action_scale" in metadata and "default_joint_pos" in metadata and robot and clause in ("", "joint_pos"):
+    if clause in ("", "joint_pos") and "action_scale" in metadata and not (robot and "default_joint_pos" in metadata):
+        absent = "default_joint_pos" if robot else "joint_names"
+        clause = f"joint target with an action_scale, but no {absent} to start from"
+    if "action_scale" in metadata and clause in ("", "joint_pos"):
         default = dict(zip(robot, numbers("default_joint_pos"), strict=True))
         scale = numbers("action_scale")
         moved = {
@@ -220,21 +258,46 @@ def _mjlab(place: str, metadata: Mapping[str, str], size: int, joint_order: Sequ
         clause = ""
     scales = [[float(part) for part in one.split(";")] for one in names("observation_terms_scale")]
     histories = numbers("observation_terms_history_length") or [0.0] * len(terms)
-    unknown = (None,) * len(robot)
+    clips = [[float(end) for end in one.split(";")] for one in names("observation_terms_clip")]
+    unknown, is_twist = (None,) * len(robot), metadata.get("command_names") == "twist"
+
+    def term(name: str, scale: list[float], history: float) -> Term:
+        size = len(scale) if len(scale) > 1 else 3 if name == "command" and is_twist else None
+        return Term(
+            name, name, size, tuple(robot), unknown, scale[0] if len(scale) == 1 else scale, max(1, int(history))
+        )
+
     return Annotation(
         place,
         joints=tuple(joints),
-        terms=tuple(
-            Term(name, name, None, tuple(robot), unknown, scale[0] if len(scale) == 1 else scale, max(1, int(history)))
-            for name, scale, history in zip(terms, scales or [[1.0]] * len(terms), histories, strict=True)
-        ),
+        terms=tuple(map(term, terms, scales or [[1.0]] * len(terms), histories)),
+        notes=tuple(filter(None, map(clip_note, terms, clips))),
         gains={key: numbers(key) for key in ("joint_stiffness", "joint_damping")},
         left_out=f"its action is a {clause}" if clause else "",
         **moved,
     )
 
 
-def _descriptors(file: Path) -> Annotation:
+def _environment(file: Path, size: int, joint_order: Sequence[str]) -> Annotation:
+    """The training's configuration: exact numbers."""
+    terms = action_terms(file, size, None, joint_order)
+    rate, notes = terms.control_rate_hz, (*terms.notes, *clip_notes(file, ("policy", "actor")))
+    if not terms.processed or terms.affine is None:
+        return Annotation(str(file), control_rate_hz=rate, notes=notes)
+    low, high = terms.bounds or (np.full(size, -np.inf), np.full(size, np.inf))
+    return Annotation(
+        str(file),
+        control_rate_hz=rate,
+        joints=tuple(element.joint for element in terms.elements),
+        command=tuple(str(element.quantity) for element in terms.elements),
+        scale=tuple(terms.affine.scale.tolist()),
+        offset=tuple(terms.affine.offset.tolist()),
+        clip=tuple(zip(low.tolist(), high.tolist(), strict=True)),
+        notes=notes,
+    )
+
+
+def _descriptors(file: Path, joint_order: Sequence[str]) -> Annotation:
     """Isaac Lab's ManagerBasedEnv.get_IO_descriptors."""
     described = read_yaml(file)
     terms = [
@@ -250,12 +313,22 @@ def _descriptors(file: Path) -> Annotation:
     group = groups.get("policy", groups.get("actor", next(iter(groups.values())) if len(groups) == 1 else []))
     texts = [str((term.get("extras") or {}).get("description")) for term in group]
     orders = [order for order in ("wxyz", "xyzw") if any(f"({', '.join(order)})" in text for text in texts)]
-    step = (described.get("scene") or {}).get("dt")
+    scene = described.get("scene") or {}
+    step, physics, decimation = (scene.get(key) for key in ("dt", "physics_dt", "decimation"))
+    if step and physics and decimation and not np.isclose(step, physics * decimation, rtol=1e-4):
+        raise CheckpointError(f"{file}: dt is {step} s, but {decimation} times physics_dt are {physics * decimation} s")
     robot: Mapping[str, Any] = next(iter((described.get("articulations") or {}).values()), {})
+    own = robot.get("joint_names") or [joint for _, joints, _, _ in terms for joint in joints]
+    if own and joint_order and [joint for joint in own if joint in joint_order] != list(joint_order):
+        raise CheckpointError(f"the joint order that was given ({_text(tuple(joint_order))}) is not that of {file} "
+                              f"({_text(tuple(own))})")  # fmt: skip
+    observed = tuple(_described_term(term) for term in group)
     return Annotation(
         str(file),
+        notes=tuple(filter(None, (clip_note(str(t["name"]), (t.get("overloads") or {}).get("clip")) for t in group))),
+        observation_size=sum((term.size or 0) * term.history for term in observed) or None,
         control_rate_hz=1.0 / step if step else None,
-        terms=tuple(_described_term(term) for term in group),
+        terms=observed,
         gains={key: robot[key] for key in ("default_joint_stiffness", "default_joint_damping") if key in robot},
         order=orders[0] if len(orders) == 1 else "",
         action_size=sum(size for _, _, size, _ in terms),
@@ -271,18 +344,30 @@ def _commands(file: Path, terms: Iterable[tuple[str, list[str], int, Mapping[str
             return {"left_out": f"an action term is a {kind}, which is more than a scale and an offset"}
         moved["joints"] += joints
         moved["command"] += [KINDS[kind][2]] * size
-        for key, default in (("scale", 1.0), ("offset", 0.0)):
-            given = term.get(key)
-            moved[key] += _each(str(file), key, default if given is None else given, size)
-        moved["clip"] += term.get("clip") or [[-np.inf, np.inf]] * size
+        for key in ("scale", "offset"):
+            if term.get(key) is None:
+                raise CheckpointError(f"{file}: the {kind} has no {key}, and a guess would move the joints wrongly")
+            moved[key] += _each(str(file), key, term[key], size)
+        moved["clip"] += _sides(str(file), term.get("clip") or [[-np.inf, np.inf]] * size, size)
     return {key: _tuples(values) for key, values in moved.items()}
+
+
+def _sides(place: str, given: Any, size: int) -> list[list[float]]:
+    """Return [low, high] for each element of a term. Raises CheckpointError for anything else."""
+    sides = np.asarray(given, np.float64)  # a ValueError if it is ragged
+    if sides.shape != (size, 2) or not (sides[:, 0] <= sides[:, 1]).all():
+        raise CheckpointError(
+            f"{place}: the action's clip is {given}: expected [low, high] for each of {size} elements"
+        )
+    return [list(map(float, side)) for side in sides]
 
 
 def _described_term(term: Mapping[str, Any]) -> Term:
     overloads = term.get("overloads") or {}
     joints = tuple(term.get("joint_names") or ())
     offsets = term.get("joint_pos_offsets", term.get("joint_vel_offsets")) or [0.0] * len(joints)
-    kind = re.split(r"[.:]", str(term["full_path"]))[-1]
+    is_own = not LIBRARIES.match(str(term["full_path"])) or (term.get("extras") or {}).get("modifiers")
+    kind = "" if is_own else re.split(r"[.:]", str(term["full_path"]))[-1]
     history = max(1, int(overloads.get("history_length") or 0))
     size = int(np.prod(term["shape"]))
     return Term(str(term["name"]), kind, size, joints, offsets, overloads.get("scale"), history)
@@ -298,8 +383,14 @@ def _deploy(file: Path, size: int, joint_order: Sequence[str]) -> Annotation:
         )
     actions = []
     for name, term in described["actions"].items():
-        joints = [joint_order[i] for i in term["joint_ids"]] if term.get("joint_ids") and joint_order else joint_order
-        actions.append((name, list(joints), len(term["scale"]), term))
+        joints = selected(joint_order, term.get("joint_ids")) if joint_order else []
+        actions.append((name, joints, len(term["scale"]), term))
+        offset = term.get("offset")
+        if isinstance(offset, list) and offset != default and sorted(offset) == sorted(default):
+            raise CheckpointError(
+                f"{file}: default_joint_pos is {default}, but the offset of {name} has the same numbers as {offset}: "
+                "they are in different joint orders"
+            )
     total = sum(count for _, _, count, _ in actions)
     if total != size:
         raise CheckpointError(f"{file}: the actions' scale has {total} numbers, but the action has {size} elements")
@@ -315,6 +406,7 @@ def _deploy(file: Path, size: int, joint_order: Sequence[str]) -> Annotation:
         action_size=total,
         control_rate_hz=1.0 / float(described["step_dt"]),
         terms=tuple(terms),
+        notes=tuple(filter(None, (clip_note(n, term.get("clip")) for n, term in described["observations"].items()))),
         gains={key: described[key] for key in ("stiffness", "damping") if key in described},
         **_commands(file, actions),
     )

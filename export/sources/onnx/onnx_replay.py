@@ -104,15 +104,17 @@ class OrtLoop:
             action, *after = found
             named = zip(self._tensors.states.items(), after, strict=True)
             self._rows[row] = {}
-            outputs = {"action": self._sent(action.reshape(self._tensors.action.row))}
+            outputs = {"action": self._sent(action.reshape(self._tensors.action.row), inputs, row)}
             for (name, (into, _)), values in named:
                 self._rows[row][into.name] = values
                 outputs[f"state_out.{name}"] = values.reshape(into.row)
             rows.append(outputs)
         return {name: np.stack([each[name] for each in rows]) for name in rows[0]}
 
-    def _sent(self, action: NDArray[Any]) -> NDArray[Any]:
+    def _sent(self, action: NDArray[Any], inputs: Inputs, row: int) -> NDArray[Any]:
         if self._recipe.affine is not None:
             action = self._recipe.affine.apply(action)
+        if (present := self._recipe.present) is not None:
+            action = np.clip(action, present.low, present.high) + present.positions(inputs["obs"][row])
         space = self._recipe.action_space
         return np.asarray(np.clip(action, space.low, space.high), np.float32)

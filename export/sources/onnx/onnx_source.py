@@ -88,6 +88,7 @@ class GivenOnnx(Source):
         from rlservo.export.sources.onnx.onnx_replay import OrtLoop, golden_sets, one_row, open_given
         from rlservo.export.sources.onnx.onnx_tensors import describe_graph
         from rlservo.export.sources.onnx_stage import read_graph
+        from rlservo.export.sources.present_position import with_targets
         from rlservo.export.sources.restored_policy import RestoredPolicy
 
         file = files.root
@@ -109,13 +110,15 @@ class GivenOnnx(Source):
                         f"{annotation.place}: {key} is {only} for every joint: some exporters write this for gains "
                         "they do not know; check it before a robot uses it"
                     )
+            for note in annotation.notes:
+                notify(f"{annotation.place}: {note}")
             if annotation.left_out:
                 notify(f"{annotation.place}: {annotation.left_out}: the export gives the policy's own numbers")
         if tensors.unused:
             notify(f"{file.name}: left out, as '{tensors.action.name}' is the action: {', '.join(tensors.unused)}")
         said = merged(annotations)
         recipe = _recipe(said, file, tensors, options)
-        elements = _elements(said, recipe, main, options.joint_order)
+        recipe, elements = with_targets(recipe, _elements(said, recipe, main, options.joint_order))
         _ask(elements, recipe, options, notify)
         first = {tensor.key: torch.zeros(tensor.shape, dtype=getattr(torch, tensor.dtype)) for tensor in tensors.zeros}
         network = Pipeline(tensors.description, first)
@@ -203,7 +206,7 @@ def _elements(said: Annotation, recipe: Recipe, main: StageTensor | None, joint_
         raise CheckpointError(f"the joint order has {len(joints)} joints, but the action has {size} elements")
     if twice := [joint for joint in dict.fromkeys(joints) if joints.count(joint) > 1]:
         raise CheckpointError(f"the action's joints ({', '.join(joints)}) have {', '.join(twice)} more than once")
-    if joint_order and list(joints) != [joint for joint in joint_order if joint in joints]:
+    if not set(joints) <= set(joint_order or joints):
         raise CheckpointError(
             f"the joint order that was given ({', '.join(joint_order)}) is not that of {said.place} "
             f"({', '.join(joints)})"
@@ -217,7 +220,11 @@ def _elements(said: Annotation, recipe: Recipe, main: StageTensor | None, joint_
         actions.append(Element(name=joint or f"action_{index}", joint=joint, **known))
     observation: tuple[Element, ...] = ()
     if main is not None and said.terms:
-        observation = fill([_term(term, actions, said.order) for term in said.terms], int(np.prod(main.row)))
+        terms = [_term(term, actions, said) for term in said.terms]
+        # mjlab does not say which joints a term has: only a size that fits shows that it has all.
+        if not (any(isinstance(each, str) for each in terms) and any(term.size is None for term in said.terms
+                                                                     if term.kind in JOINTS)):  # fmt: skip
+            observation = fill(terms, int(np.prod(main.row)))
     elif main is not None:
         observation = tuple(Element(name=name) for name in said.observation_names)
     alone = not isinstance(recipe.observation_space, Dict)
@@ -228,16 +235,16 @@ def _elements(said: Annotation, recipe: Recipe, main: StageTensor | None, joint_
     )
 
 
-def _term(term: Term, actions: Sequence[Element], order: str) -> list[Element] | str:
+def _term(term: Term, actions: Sequence[Element], said: Annotation) -> list[Element] | str:
     """Return a term's elements; its name if their number is not known."""
     elements = [Element(name=f"{term.name}_{index}") for index in range(term.size or 0)]
     known: list[Element] = []
     if term.kind in JOINTS and term.joints:
         known = joint_elements(term.name, term.kind, term.joints, term.offsets)
     elif term.kind in BODY:
-        known = body_elements(term.name, term.kind, order)
+        known = body_elements(term.name, term.kind, said.order)
     elif term.kind in ("last_action", "actions"):
-        known = last_action(term.name, actions)
+        known = last_action(term.name, actions, *((said.scale, said.offset) if _is_scaled(said) else ()))
     elif term.kind == "velocity_commands":
         known = velocity_command(term.name)
     if len(known) == (term.size or len(known)):
@@ -245,7 +252,13 @@ def _term(term: Term, actions: Sequence[Element], order: str) -> list[Element] |
     elements = scaled(elements, term.scale)
     if term.history > 1:
         steps = reversed(range(term.history))
-        elements = [e.model_copy(update={"name": f"{e.name}_{step}_before"}) for step in steps for e in elements]
+        elements = [  # only the last is what a robot measures now
+            e.model_copy(update={"name": f"{e.name}_0_before"})
+            if step == 0
+            else Element(name=f"{e.name}_{step}_before")
+            for step in steps
+            for e in elements
+        ]
     return elements or term.name
 
 

@@ -85,7 +85,7 @@ def estimate(
     seed: int = 0,
     progress: Callable[[str], object] = lambda _: None,
 ) -> EstimateReport:
-    """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploring policy.
+    """Estimate the mean return of a bundle's deterministic policy, or with `explore` of its exploratory policy.
 
     `progress` gets the current activity. Raises OtherContractError if the recording does not fit the bundle, and
     UsageError if no episode can be used.

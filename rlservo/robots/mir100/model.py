@@ -1,4 +1,4 @@
-"""Builds the MuJoCo model of the robot in one of its worlds.
+"""MuJoCo model of the robot in one of its worlds.
 
 The robot is a planar body (x, y, yaw of base_link) driven as two wheels on an axle drive it: a motor ahead, a motor for
 turning, and a grip that lets nothing slide sideways. Rolling wheels and casters were tried: at the same physics step a
@@ -6,8 +6,6 @@ control cycle took 144 us instead of 23 us, and the body shivered on its six con
 """
 
 from __future__ import annotations
-
-import mujoco
 
 from rlservo.robots.mir100.parameters import (
     BACK_SCANNER,
@@ -38,17 +36,13 @@ TURN_TORQUE = DRIVE_FORCE * WHEEL_SEPARATION / 2  # [Nm]
 YAW_INERTIA = MASS * ((LENGTH**2 + WIDTH**2) / 12 + BODY_CENTRE[0] ** 2)  # [kg m^2]
 
 
-def build_model(world: World) -> mujoco.MjModel:
-    """Return the compiled model.
+def model_xml(world: World) -> str:
+    """Return the model.
 
     Joints `x`, `y`, `yaw` are base_link's pose. Actuators `drive` [m/s], `grip` [m/s, to the left] and `turn` [rad/s]
     are velocity servos in the robot's own frame. Mocap bodies: `target` and `cube_0`, `cube_1`, ... Only the robot's
     body collides, with walls and cubes.
     """
-    return mujoco.MjModel.from_xml_string(_document(world))
-
-
-def _document(world: World) -> str:
     return f"""
 <mujoco model="mir100 in {world.name}">
   <compiler angle="radian" autolimits="true"/>

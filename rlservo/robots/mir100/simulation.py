@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from rlservo.robots.arm_interface import Vector
 from rlservo.robots.disturbable import MAX_MODEL_ERROR
 from rlservo.robots.mir100.lasers import LaserScanners
-from rlservo.robots.mir100.model import TIMESTEP, build_model
+from rlservo.robots.mir100.model import TIMESTEP, model_xml
 from rlservo.robots.mir100.parameters import (
     BEAM_COUNT,
     COMMAND_TIMEOUT_S,
@@ -57,7 +57,8 @@ class Mir100Simulation(Robot):
         if not 0.0 <= laser_noise < math.inf:
             raise ValueError(f"laser_noise is {laser_noise:g}: expected a standard deviation in m, 0 for none")
         self.world = find_world(world)
-        self.model: mujoco.MjModel = build_model(self.world)
+        self.xml = model_xml(self.world)
+        self.model: mujoco.MjModel = mujoco.MjModel.from_xml_string(self.xml)
         self.data = mujoco.MjData(self.model)
         self.rng = np.random.default_rng() if rng is None else rng
         self.in_collision = False

@@ -11,8 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
-
 from rlservo.robots.ur.model import ARMATURE, LOOKS, TIMESTEP, Table, scene, servos
 from rlservo.robots.ur.objects import object_model
 
@@ -51,8 +49,8 @@ class PandaParameters:
     effort_limits: tuple[float, ...] = (87.0, 87.0, 87.0, 87.0, 15.0, 12.0, 12.0)  # [Nm]
 
 
-def build_model(parameters: PandaParameters, *, objects: Sequence[str] = (), table: Table = True) -> mujoco.MjModel:
-    """Return the compiled model: the arm's base at the world's origin, in the middle of robo-gym's table.
+def model_xml(parameters: PandaParameters, *, objects: Sequence[str] = (), table: Table = True) -> str:
+    """Return the model: the arm's base at the world's origin, in the middle of robo-gym's table.
 
     Joints and actuators are named as in JOINTS, each with two actuators that together are one servo, as a UR's are;
     `panda_hand` is a site. Object i is the mocap body `object_<i>`.
@@ -65,7 +63,7 @@ def build_model(parameters: PandaParameters, *, objects: Sequence[str] = (), tab
         <!-- Without gravcomp: the arm does not know what it carries. -->
         <body name="payload" pos="0 0 {HAND_HEIGHT}"><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>
       </body>"""
-    return mujoco.MjModel.from_xml_string(f"""
+    return f"""
 <mujoco model="panda">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{TIMESTEP}" integrator="implicitfast"/>
@@ -87,7 +85,7 @@ def build_model(parameters: PandaParameters, *, objects: Sequence[str] = (), tab
     {servos(JOINTS, list(zip(LOW, HIGH, strict=True)), parameters.effort_limits)}
   </actuator>
 </mujoco>
-""")
+"""
 
 
 def _link(index: int, effort: float) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rlservo.robots.panda.model import JOINTS, LINKS, PandaParameters, build_model
+from rlservo.robots.panda.model import JOINTS, LINKS, PandaParameters, model_xml
 from rlservo.robots.ur.model import Table
 from rlservo.robots.ur.simulation import ArmSimulation
 
@@ -31,7 +31,7 @@ class PandaSimulation(ArmSimulation):
         parameters = PandaParameters()
         super().__init__(
             parameters,
-            build_model(parameters, objects=objects, table=table),
+            model_xml(parameters, objects=objects, table=table),
             tool="panda_hand",
             max_velocity_scale=max_velocity_scale,
             cycle_s=cycle_s,

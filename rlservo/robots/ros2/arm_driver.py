@@ -62,6 +62,8 @@ KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTOR
 class RosArmConnection:
     """The arm's topics."""
 
+    frames: Vector | None = None
+
     def __init__(self, settings: ServoSettings) -> None:
         """Wait for every input, then take the command topic. Raises RobotError."""
         self._address = address = RosAddress.parse(settings.host, ARM_OPTIONS)

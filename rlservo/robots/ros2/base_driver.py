@@ -40,6 +40,7 @@ from rlservo.robots.ros2.link import (
     take_command,
     wait_until,
 )
+from rlservo.robots.ros2.plausibility import Progress, ScanChange, moved
 from rlservo.robots.ros2.ros_messages import (
     FLAG,
     LASER_SCAN,
@@ -57,12 +58,14 @@ from rlservo.robots.ros2.ros_messages import (
 RATE_HZ = 20.0
 FRAMES_S = 5.0  # [s] in which static transforms arrive after the first messages
 AGE_BOUND_S = 0.3  # [s] oldest input that may be acted on: scans come at 12.5 Hz, or 10
+SAME_PLACE = 0.01  # [m], [rad], by which a frame's place may differ from the first one
 JUMP = (0.1, 0.3)  # [m], [rad], beyond what the base can move, that count as a jump
 LOST_S = 2.0  # [s] without odometry, after which the connection counts as lost
 DEADMAN_S = 0.5  # [s], oldest dead-man message
 TWISTS = {"auto": (TWIST, TWIST_STAMPED), "Twist": (TWIST,), "TwistStamped": (TWIST_STAMPED,)}
 FASTEST = np.array([MAX_LINEAR_VELOCITY, MAX_ANGULAR_VELOCITY])
 STANDS = 0.01  # [m/s]
+AT_REST = 0.05  # [m/s], [rad/s], below which a person may lead the base: an odometry may be noisy
 BLOCKED_S = 1.0  # of standing before something, after which the base counts as blocked
 OBSTRUCTIONS = {
     "stop_distance": "something is within stop_distance on its way",
@@ -185,7 +188,8 @@ class RosBase:
             scans = self._scan_topics() if needs_scan or self.limits.stop_distance else {}
             for topic in (address["odom"], *scans):
                 self._inputs[topic] = _Input(link.now_s, has_own_clock=has_own_clock)
-            self._frames = Frames()
+            self._frames, self._places = Frames(), dict[str, Matrix]()  # places by topic
+            self._progress = Progress()
             self._without_frames = self._subscribe_frames()
             link.subscribe(address["odom"], ODOMETRY, self._take_odometry)
             for topic, pose in scans.items():
@@ -224,7 +228,7 @@ class RosBase:
         self._order = Order.HOLD
 
     def free(self) -> None:
-        """Stop publishing, so that a person may drive."""
+        """Decelerate, then stop publishing, so that a person may drive."""
         self._order = Order.FREE
 
     def blend_in(self) -> None:
@@ -300,14 +304,15 @@ class RosBase:
 
     def _subscribe_scan(self, topic: str, pose: tuple[float, float, float] | None) -> None:
         given, option = None if pose is None else planar_transform(*pose), self._pose_option(topic)
-        free = self.address["unknown_beams"] == "free"
+        free, change = self.address["unknown_beams"] == "free", ScanChange()
 
         def take(message: Any) -> None:
             place = self._place(topic, message.header.frame_id, option) if given is None else given
             try:
-                self._inputs[topic].take(
-                    message, None if place is None else read_scan(message, place, unknown_is_free=free)
-                )
+                seen = None if place is None else read_scan(message, place, unknown_is_free=free)
+                if seen is not None and (odometry := self._inputs[self.address["odom"]].value) is not None:
+                    change.check(seen.points, odometry[0])
+                self._inputs[topic].take(message, seen)
             except ValueError as error:
                 self._inputs[topic].refuse(f"{topic} cannot be used: {error}")
                 raise
@@ -336,23 +341,29 @@ class RosBase:
         if one.value is None or made_s is None or made_s <= one.made_s:
             return
         passed_s = min(made_s - one.made_s, time.monotonic() - one.received_s + LOST_S)
-        (x, y, yaw), (x0, y0, yaw0) = state[0], one.value[0]
-        moved, turned = math.hypot(x - x0, y - y0), abs(math.remainder(yaw - yaw0, 2.0 * math.pi))
-        if (
-            moved > JUMP[0] + 2.0 * MAX_LINEAR_VELOCITY * passed_s
-            or turned > JUMP[1] + 2.0 * MAX_ANGULAR_VELOCITY * passed_s
-        ):
-            jump = f"{moved:.2f} m and {turned:.2f} rad in {passed_s:.2f} s"
+        way = moved(state[0], one.value[0])
+        if (way > JUMP + 2.0 * FASTEST * passed_s).any():
+            jump = f"{way[0]:.2f} m and {way[1]:.2f} rad in {passed_s:.2f} s"
             self.fault = self.fault or (
                 f"odometry_jumped: {self.address['odom']} moved by {jump}: is it published twice, or was it reset"
             )
+
+    def _check_progress(self, passed_s: float) -> None:
+        """Note a fault if the odometry stands while the base is driven, as it was for the last `passed_s` [s]."""
+        topic = self.address["odom"]
+        why = self._progress.note(self._velocity, passed_s, self._inputs[topic].value[0])
+        if why and not self.fault:
+            self.fault = f"not_following: {topic} {why}: is it frozen, or the base blocked, or not powered"
 
     def _place(self, topic: str, frame: str, option: str) -> Matrix | None:
         """Return the transform of a message's frame into the base's; None, and note why, if it is not known."""
         base_frame, one = self.address["base_frame"], self._inputs[topic]
         if frame and (place := self._frames.transform(frame, base_frame)) is not None:
-            one.problem = ""
-            return place
+            if np.abs(place - self._places.setdefault(topic, place)).max() <= SAME_PLACE:
+                one.problem = ""
+                return place
+            one.refuse(f"{topic}: frame {frame!r} is no longer where it was in {base_frame!r}: is it published twice")
+            return None
         why = f" ({self._without_frames})" if self._without_frames else ""
         one.refuse(
             f"{topic} is in frame {frame!r}, which /tf_static does not connect with {base_frame!r}{why}: publish that, "
@@ -392,11 +403,12 @@ class RosBase:
             due = max(due + 1.0 / RATE_HZ, now)
             if now - cycle_s > self._setpoint_timeout_s:  # this process was suspended, and the base has stopped
                 self._resumed_s, self._velocity, self._blend_from_s = now, (0.0, 0.0), now
-            cycle_s = now
+            passed_s, cycle_s = now - cycle_s, now
             try:
                 if now - looked_s > WATCH_S:
                     looked_s = now
                     self._check_publishers()
+                self._check_progress(passed_s)
                 self._velocity = self._next()
                 if time.monotonic() - now > self._setpoint_timeout_s:  # suspended meanwhile: this command is old
                     continue
@@ -445,7 +457,7 @@ class RosBase:
             before, is_ending = law.phase, self._is_closed.is_set() and self._order != Order.FREE
             is_released = self.address["deadman"] and not (self._deadman[1] and now - self._deadman[0] < DEADMAN_S)
             law.decide(
-                Order.HOLD if is_ending else self._order,
+                Order.HOLD if is_ending or self._brakes_for_a_person() else self._order,
                 passed_s=passed_s,
                 blend_from_s=self._blend_from_s,
                 setpoint_age_s=now - given_s,
@@ -459,6 +471,13 @@ class RosBase:
                 return float(linear), float(angular)
         self._unblocked_s, self._obstructed_by = now, ""  # after every interruption
         return 0.0, 0.0
+
+    def _brakes_for_a_person(self) -> bool:
+        """Return whether a person wants the base, which is not at rest yet."""
+        if self._order != Order.FREE or self.phase == Phase.FREE:
+            return False
+        _, measured = next(iter(self._inputs.values())).value
+        return self._velocity != (0.0, 0.0) or max(map(abs, measured)) > AT_REST
 
     def _older_than(self, age_s: float) -> str:
         """Return the first input whose newest value is older; empty if none is."""

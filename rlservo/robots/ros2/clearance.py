@@ -1,4 +1,4 @@
-"""Clearance of a base's motion: its body, a polygon, among what its scans show and what they do not."""
+"""Clearance of a base's motion: its body, a polygon, among scanned obstacles and space that no scan shows."""
 
 from __future__ import annotations
 

@@ -30,6 +30,7 @@ class Endpoint(NamedTuple):
 
     node: str
     type: str  # "geometry_msgs/msg/Twist"
+    mismatch: str = ""  # of a subscriber: why the quality of service keeps our messages from it
 
 
 class Topics(Protocol):
@@ -54,6 +55,8 @@ class Topics(Protocol):
 
 class Link(Topics, Protocol):
     """A connection to the graph, which knows its other nodes."""
+
+    knows_quality: bool  # whether it knows the subscribers' quality of service, and at once
 
     def publishers(self, topic: str) -> list[Endpoint]:
         """Return the publishers of other nodes."""
@@ -146,11 +149,25 @@ def take_command(link: Link, topic: str, *kinds: str, rest: Mapping[str, Any] | 
     while time.monotonic() < until:
         refuse()
         time.sleep(LOOK_S)
-    return kind, _watched(link, topic, publish, rest)
+    if why := _unheard(link, topic, kind):
+        raise RobotError(why)
+    return kind, _watched(link, topic, kind, publish, rest)
 
 
-def _watched(link: Link, topic: str, publish: Publish, rest: Mapping[str, Any] | None) -> Publish:
-    """Return a function that publishes as long as no other node commands the topic."""
+def _unheard(link: Link, topic: str, kind: str) -> str:
+    """Return why our commands reach no subscriber; empty if they reach one, or none is there."""
+    listeners = [one for one in link.subscribers(topic) if one.type == kind]
+    if not listeners or not all(one.mismatch for one in listeners):
+        return ""
+    nodes = " and ".join(f"{one.node} ({one.mismatch})" for one in listeners)
+    return (
+        f"{topic}: the quality of service keeps our commands from {nodes}: change its own, or ours (-p "
+        f"qos_overrides.{topic}.publisher...)"
+    )
+
+
+def _watched(link: Link, topic: str, kind: str, publish: Publish, rest: Mapping[str, Any] | None) -> Publish:
+    """Return a function that publishes as long as no other node commands the topic, and one can hear it."""
     looked_s = began_s = sent_s = -math.inf
     problem = ""
 
@@ -164,8 +181,10 @@ def _watched(link: Link, topic: str, publish: Publish, rest: Mapping[str, Any] |
             if others := link.rivals(topic, began_s + PASSING_S):
                 names = ", ".join(sorted({one.node for one in others}))
                 problem = f"second_commander: {topic} is also commanded by {names}: end it, as a robot obeys one node"
-                if rest is not None:
-                    publish(rest)
+            elif link.knows_quality and (why := _unheard(link, topic, kind)):
+                problem = f"unheard: {why}"
+            if problem and rest is not None:
+                publish(rest)
         if problem:
             raise RobotError(problem)
         sent_s = now

@@ -8,6 +8,7 @@ import importlib
 import logging
 import os
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from typing import Any, Literal
@@ -20,6 +21,9 @@ SERVICE_S = 3.0  # for a service to be discovered, and to answer
 KEPT_MESSAGES = 100  # each node of a graph keeps its own static transforms
 ARGUMENTS_VARIABLE = "RLSERVO_ROS_ARGS"  # remappings and parameters, also for the processes that we start
 MOST = 1e9  # a parameter's range has two ends
+RATE_S, RATE_ERROR = 5.0, 0.1  # [s] over which simulated time is compared with the wall clock's, and their difference
+
+log = logging.getLogger("rlservo.robot")
 
 Outcome = Literal["succeed", "abort", "canceled"]
 
@@ -82,6 +86,8 @@ class RosLog(logging.Handler):
 class RclpyLink:
     """A ROS 2 node with a unique name: two with one name could not be told apart."""
 
+    knows_quality = True
+
     def __init__(self, name: str, *, is_unique: bool = False) -> None:
         """Join the graph. `is_unique`: the name is used as it is, else with our process id. Raises RobotError."""
         try:
@@ -107,12 +113,17 @@ class RclpyLink:
             why = " ".join(str(error).split())  # it may point at the place, on a line of its own
             raise RobotError(f"ROS 2 does not accept the node's name or arguments, {words}: {why}") from error
         self._own: Counter[tuple[str, str]] = Counter()  # endpoints of ours, by topic
+        self._has_simulated_time = bool(self.node.get_parameter("use_sim_time").value)
+        self._clock_began = time.monotonic(), 0.0  # and ROS's time then [s]
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 
         def spin() -> None:
-            with contextlib.suppress(executors.ExternalShutdownException):
+            try:
                 self._executor.spin()
+            except Exception:
+                if self._context.ok():  # else it ended: rclpy has no common base for what that raises
+                    raise
 
         self._thread = threading.Thread(target=spin, name="ros", daemon=True)
         self._thread.start()
@@ -120,7 +131,18 @@ class RclpyLink:
 
     def now_s(self) -> float:
         """Return ROS's time [s]: the system's, or /clock's with use_sim_time."""
-        return float(self.node.get_clock().now().nanoseconds * 1e-9)
+        now_s = float(self.node.get_clock().now().nanoseconds * 1e-9)
+        began, began_s = self._clock_began
+        if self._has_simulated_time and (passed_s := time.monotonic() - began) > RATE_S:
+            self._clock_began, rate = (time.monotonic(), now_s), (now_s - began_s) / passed_s
+            if abs(rate - 1.0) > RATE_ERROR and began_s > 0.0:
+                self._has_simulated_time = False  # said once
+                log.warning(
+                    "simulated time passes at %.2g times the wall clock's rate: the policy acts, and the limits hold, "
+                    "by the wall clock",
+                    rate,
+                )
+        return now_s
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
         """Subscribe to the newest message, best effort as for sensors; also to an earlier one if publishers keep it.
@@ -267,8 +289,10 @@ class RclpyLink:
         self.node.destroy_node()
 
     def _others(self, which: str, topic: str, infos: Sequence[Any]) -> list[Endpoint]:
-        found = [Endpoint(f"{one.node_namespace.rstrip('/')}/{one.node_name}", one.topic_type) for one in infos]
         own, others = self.node.get_fully_qualified_name(), []
+        offers = [one.qos_profile for one in self.node.get_publishers_info_by_topic(topic) if _name_of(one) == own]
+        mismatches = [_mismatch(offers[0], one) if which == "subscriber" and offers else "" for one in infos]
+        found = [Endpoint(_name_of(one), one.topic_type, why) for one, why in zip(infos, mismatches, strict=True)]
         mine = self._own[which, self.node.resolve_topic_name(topic)]
         for one in found:  # another node may have our name
             if one.node == own and mine:
@@ -333,6 +357,18 @@ def fill(message: Any, values: Mapping[str, Any]) -> Any:
         else:
             setattr(message, name, value)
     return message
+
+
+def _name_of(info: Any) -> str:
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
+def _mismatch(offer: Any, subscriber: Any) -> str:
+    """Return why an offered quality of service does not reach a subscriber; empty if it does."""
+    from rclpy.qos import QoSCompatibility, qos_check_compatible  # pyright: ignore[reportMissingImports]
+
+    fit, why = qos_check_compatible(offer, subscriber.qos_profile)
+    return str(why).removeprefix("ERROR: ").strip("; ") if fit == QoSCompatibility.ERROR else ""
 
 
 def _without_names(arguments: Sequence[str]) -> list[str]:

@@ -172,7 +172,7 @@ def read_scan(scan: Any, place: Matrix, *, unknown_is_free: bool = False) -> Sca
     blind scanner sees no way free, or if the scanner's plane is not horizontal.
     """
     if abs(place[2, 2]) < LEVEL:
-        raise ValueError(f"its frame {scan.header.frame_id!r} is inclined: expected a scanner with a horizontal plane")
+        raise ValueError(f"its frame {scan.header.frame_id!r} is tilted: expected a scanner with a horizontal plane")
     ranges = np.array([math.nan if one is None else one for one in scan.ranges], dtype=np.float64)
     ranges[np.isneginf(ranges)] = scan.range_min
     angles = scan.angle_min + scan.angle_increment * np.arange(len(ranges))

@@ -25,6 +25,8 @@ OWN_MESSAGES = 100  # that may be on their way through the bridge and back
 class RosbridgeLink:
     """A client of a rosbridge. All clients share the bridge's node."""
 
+    knows_quality = False
+
     def __init__(self, host: str, port: int) -> None:
         """Connect. Raises RobotError without roslibpy, or if no rosbridge answers."""
         try:

@@ -1,4 +1,4 @@
-"""Builds the MuJoCo model of one arm on its table from the parameter table.
+"""MuJoCo model of one arm on its table from the parameter table.
 
 Link frames are those of the ROS description (ur_description), so that `tool0` is where robo-gym's robot server reports
 the end effector. Each link is one or two capsules along the real housing's centre line.
@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from typing import Literal
-
-import mujoco
 
 from rlservo.robots.ur.objects import ObjectModel, object_model
 from rlservo.robots.ur.parameters import JOINTS, POSITION_LIMITS, TABLE_CENTRE, TABLE_SIZE, URParameters
@@ -60,10 +58,8 @@ LOOKS = """<visual>
 OBJECT_SOFTNESS = 'priority="1" condim="1" solimp="0.0001 0.0001 0.001 0.5 1"'
 
 
-def build_model(
-    arm: URParameters, *, objects: Sequence[str] = ("sphere50_no_collision",), table: Table = True
-) -> mujoco.MjModel:
-    """Return the compiled model: the arm standing on the table (or 0.1 m above bare ground) and the objects named.
+def model_xml(arm: URParameters, *, objects: Sequence[str] = ("sphere50_no_collision",), table: Table = True) -> str:
+    """Return the model: the arm standing on the table (or 0.1 m above bare ground) and the objects named.
 
     With "isaac" the table is Isaac Lab's and the ground 1 m below the base; without a table a post that nothing
     collides with is drawn. Object i is the mocap body `object_<i>`.
@@ -72,10 +68,6 @@ def build_model(
     are one servo: `<joint>` integrates its control, a velocity [rad/s], into a position setpoint, `<joint>_velocity`
     feeds the same velocity forward. Their sum, gravity compensation included, is limited to the joint's effort.
     """
-    return mujoco.MjModel.from_xml_string(_document(arm, [object_model(name) for name in objects], table))
-
-
-def _document(arm: URParameters, objects: list[ObjectModel], table: Table) -> str:
     s = arm.size
     housing, cap = "0.78 0.79 0.81 1", "0.29 0.52 0.75 1"
 
@@ -99,7 +91,7 @@ def _document(arm: URParameters, objects: list[ObjectModel], table: Table) -> st
   <option timestep="{TIMESTEP}" integrator="implicitfast"/>
   {LOOKS}
   <worldbody>
-    {scene(BASE_HEIGHT, table, objects)}
+    {scene(BASE_HEIGHT, table, [object_model(name) for name in objects])}
     <body name="base_link" pos="0 0 {BASE_HEIGHT}">
       <body name="base" euler="0 0 {math.pi}">
         {capsule((0, 0, SHOULDER_RADIUS * s), (0, 0, arm.d1), SHOULDER_RADIUS, m[0], cap)}

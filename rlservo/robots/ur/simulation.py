@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from rlservo.robots.arm_interface import Vector
 from rlservo.robots.disturbable import MAX_MODEL_ERROR
 from rlservo.robots.robot_port import Robot
-from rlservo.robots.ur.model import BASE_HEIGHT, TIMESTEP, Table, build_model
+from rlservo.robots.ur.model import BASE_HEIGHT, TIMESTEP, Table, model_xml
 from rlservo.robots.ur.object_paths import UPDATE_RATE_HZ, Path
 from rlservo.robots.ur.parameters import JOINTS, ur_parameters
 
@@ -60,8 +60,8 @@ class ArmSimulation(Robot):
     """One arm and its scene, at 200 Hz physics, or the next higher rate with a whole number of steps per control cycle.
 
     `max_velocity_scale` multiplies the arm's joint velocity limits, as the robot server's parameter of that name.
-    `model` has an actuator and a `<joint>_velocity` for each of JOINTS, bodies LINKS, payload and `object_<i>`, and a
-    site `tool`, which is the end effector.
+    `xml` is the model, with an actuator and a `<joint>_velocity` for each of JOINTS, bodies LINKS, payload and
+    `object_<i>`, and a site `tool`, which is the end effector.
     """
 
     JOINTS: ClassVar[tuple[str, ...]]
@@ -71,25 +71,28 @@ class ArmSimulation(Robot):
     def __init__(
         self,
         parameters: _Limits,
-        model: mujoco.MjModel,
+        xml: str,
         *,
         tool: str,
         max_velocity_scale: float,
         cycle_s: float,
         object_count: int,
+        min_trajectory_s: float = MIN_TRAJECTORY_S,
     ) -> None:
         if not 0.0 < max_velocity_scale <= 1.0:
             raise ValueError(f"max_velocity_scale_factor is {max_velocity_scale:g}: expected more than 0, at most 1")
-        self.model: mujoco.MjModel = model
+        self.xml = xml
+        self.model: mujoco.MjModel = mujoco.MjModel.from_xml_string(xml)
         self.data = mujoco.MjData(self.model)
         self._effort_limits = parameters.effort_limits
-        self.velocity_scale, self.cycle_s = max_velocity_scale, cycle_s
+        self.velocity_scale, self.cycle_s, self._min_trajectory_s = max_velocity_scale, cycle_s, min_trajectory_s
         self.max_velocity = max_velocity_scale * np.array(parameters.velocity_limits)  # [rad/s], (joints,)
         self._substeps = math.ceil(cycle_s / TIMESTEP - 1e-9)
         if abs(self._substeps * TIMESTEP - cycle_s) > 1e-9:
             self.model.opt.timestep = cycle_s / self._substeps
         self._servo = np.array([self.data.actuator(name).id for name in self.JOINTS])
         self._feed_forward = np.array([self.data.actuator(f"{name}_velocity").id for name in self.JOINTS])
+        self.tool = tool
         self._tool = self.model.site(tool).id
         self._tool_xpos = self.data.site_xpos[self._tool]  # views that stay valid: MjData never moves
         self._tool_xmat = self.data.site_xmat[self._tool]
@@ -194,12 +197,12 @@ class ArmSimulation(Robot):
     def command(self, joint_positions: ArrayLike) -> float:
         """Replace the trajectory: move to `joint_positions` [rad] (joints,), all joints arriving together.
 
-        It takes max(0.5 s, the slowest joint's travel at its scaled velocity limit) and starts at the current setpoint.
+        It takes max(`min_trajectory_s`, the slowest joint's travel at its scaled velocity limit), from the setpoint.
         Return how long it takes [s].
         """
         goal = np.asarray(joint_positions, dtype=np.float64)
         way = goal - self.data.act
-        duration = max(MIN_TRAJECTORY_S, float((np.abs(way) / self.max_velocity).max()))
+        duration = max(self._min_trajectory_s, float((np.abs(way) / self.max_velocity).max()))
         timestep = float(self.model.opt.timestep)
         # Whole substeps, rounded up so that no joint exceeds its limit and the last substep ends at the goal.
         self._remaining = max(1, math.ceil(duration / timestep - 1e-9))
@@ -370,19 +373,44 @@ class URSimulation(ArmSimulation):
         objects: Sequence[str] = ("sphere50_no_collision",),
         table: Table = True,
         tool: str = "tool0",
+        min_trajectory_s: float = MIN_TRAJECTORY_S,
     ) -> None:
         self.ur_model, self.parameters = ur_model, ur_parameters(ur_model)
         super().__init__(
             self.parameters,
-            build_model(self.parameters, objects=objects, table=table),
+            model_xml(self.parameters, objects=objects, table=table),
             tool=tool,
             max_velocity_scale=max_velocity_scale,
             cycle_s=cycle_s,
             object_count=len(objects),
+            min_trajectory_s=min_trajectory_s,
         )
         forearm = self.model.body("forearm").id
         self._forearm_xpos = self.data.xpos[forearm]
         self._forearm_xmat = self.data.xmat[forearm]
+
+    def calibrate(self, frames: Vector) -> None:
+        """Give the model a real arm's kinematics: joints' axes and flange as in `calibration.py`'s frames (7, 4, 4).
+
+        A link keeps its place along its joint's axis and about it, which an axis does not tell.
+        """
+        model, data = self.model, mujoco.MjData(self.model)
+        mujoco.mj_kinematics(model, data)
+        base = _pose(data.body("base"))
+        flange = base @ frames[6] @ np.linalg.inv(_pose(data.site("tool0")))
+        sites = [(model.site(name), flange @ _pose(data.site(name))) for name in ("tool0", "tool1")]
+        parent = base
+        for link, frame in zip(self.LINKS, base @ frames[:6], strict=True):
+            pose, axis = _pose(data.body(link)), frame[:3, 2]
+            across = np.cross(pose[:3, 2], axis)
+            cross = np.cross(across, np.eye(3)).T
+            pose[:3, :3] = (np.eye(3) + cross + cross @ cross / (1.0 + pose[:3, 2] @ axis)) @ pose[:3, :3]
+            pose[:3, 3] = frame[:3, 3] + axis * (axis @ (pose[:3, 3] - frame[:3, 3]))
+            _place(model.body(link), np.linalg.inv(parent) @ pose)
+            parent = pose
+        for site, pose in sites:
+            _place(site, np.linalg.inv(parent) @ pose)
+        mujoco.mj_setConst(model, data)
 
     @property
     def forearm_position(self) -> Vector:
@@ -395,3 +423,16 @@ class URSimulation(ArmSimulation):
     def forearm_rotation(self) -> Vector:
         """The rotation matrix (3, 3) whose columns are the forearm link's axes in base_link."""
         return self._forearm_xmat.reshape(3, 3)  # type: ignore[no-any-return]
+
+
+def _pose(view: Any) -> Vector:
+    """Return the pose in the world (4, 4) of a body or site."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = view.xmat.reshape(3, 3), view.xpos
+    return pose
+
+
+def _place(view: Any, pose: Vector) -> None:
+    """Put a body, or a site, at a pose (4, 4) in its parent's frame."""
+    view.pos[:] = pose[:3, 3]
+    mujoco.mju_mat2Quat(view.quat, pose[:3, :3].flatten())

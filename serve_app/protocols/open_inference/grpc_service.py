@@ -43,7 +43,7 @@ from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL, SPARE, check_length
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.sessions.request import TRACEPARENT, Request, trace_id
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 PROTOCOL = "grpc"
 REQUEST_ID = "x-request-id"

@@ -40,11 +40,11 @@ from rlservo.serve_app.protocols.http_endpoint import (
 )
 from rlservo.serve_app.protocols.open_inference.tensors import DTYPES, read_inputs, write_tensor
 from rlservo.serve_app.protocols.request_fields import Options, fill_request, parse_fields, parse_json, strict
-from rlservo.serve_app.protocols.routes import POST, Route, of_policy
+from rlservo.serve_app.protocols.routing import POST, Route, of_policy
 from rlservo.serve_app.server.content_bounds import SMALL, check_json
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.sessions.request import LONGEST_SESSION_ID, Request, reply_fields
-from rlservo.serve_app.versions.loaded_versions import Decision
+from rlservo.serve_app.versions.policy_store import Decision
 
 LENGTH_HEADER = b"inference-header-content-length"  # of the JSON; binary tensors follow it
 STATE_IN, STATE_OUT = "state_in.", "state_out."

@@ -27,7 +27,7 @@ from rlservo.serve_app.protocols.http_endpoint import OCTETS, check_media_type
 from rlservo.serve_app.protocols.open_inference.infer import STATE_IN, STATE_OUT, is_optional, model_of
 from rlservo.serve_app.protocols.open_inference.tensors import datatype_of
 from rlservo.serve_app.protocols.request_fields import parse_fields, parse_json, strict
-from rlservo.serve_app.protocols.routes import GET, POST, Answer, Call, Route, of_policy
+from rlservo.serve_app.protocols.routing import GET, POST, Answer, Call, Route, of_policy
 from rlservo.serve_app.server.api_keys import Access
 from rlservo.serve_app.server.content_bounds import SMALL
 from rlservo.serve_app.server.metrics import IDLE, Metrics, sum_of

@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from bundles import rewrite_contract
 from command_line import rlservo_here
 from rlservo.bundle.contract import Evaluation
 
@@ -46,7 +46,7 @@ def test_it_lists_what_a_policy_was_made_of(all_shipped: Path, tmp_path: Path) -
         assert set(parsed["dependencies"][0]["dependsOn"]) == {part["bom-ref"] for part in parsed["components"]}
 
 
-def test_evaluations_are_its_metrics(ur5: Path, tmp_path: Path, rewrite_contract: Callable[..., None]) -> None:
+def test_evaluations_are_its_metrics(ur5: Path, tmp_path: Path) -> None:
     bundle = shutil.copytree(ur5, tmp_path / "ur5" / "1")
     evaluation = Evaluation(
         env_id="rlservo/EndEffectorPositioningURSim-v0", episodes=200, first_seed=0, return_bundle=1.83,

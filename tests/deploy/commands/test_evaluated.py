@@ -44,8 +44,11 @@ def test_a_policy_that_was_served_starts_again_after_an_evaluation(
     assert rlservo_here("policy", "alias", "ur5", "production=1", "--repository", place).returncode == 0
     (plans,) = [*repository.rglob(".plan"), *state.rglob(".plan")]
     before = start(place, plans.parent)
+    (signature := repository / "ur5" / "1" / "model.sig").write_text("{}")  # of what is signed now
     evaluated = rlservo_here("verify", repository / "ur5" / "1", *EVALUATE)
     assert evaluated.returncode == 0, evaluated.stderr
+    assert "evaluations and is removed" in " ".join(evaluated.stderr.split())
+    assert not signature.exists()
     assert str(plans) in evaluated.stderr
     assert len(read_contract(repository / "ur5" / "1").evaluations) == 2
     assert start(place, plans.parent) == before

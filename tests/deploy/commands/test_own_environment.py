@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
+from bundles import write_box_policy
 from command_line import rlservo
 
 MINE = """
@@ -29,8 +29,8 @@ gym.register("Line-v0", entry_point="line_of_mine:Line")
 """
 
 
-def test_rollout_takes_the_folder_of_ones_own_environment(box_policy: Callable[..., Path], tmp_path: Path) -> None:
-    bundle = box_policy(tmp_path / "policies")
+def test_rollout_takes_the_folder_of_ones_own_environment(tmp_path: Path) -> None:
+    bundle = write_box_policy(tmp_path / "policies")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "line_of_mine.py").write_text(MINE)
     words = ("rollout", "line_of_mine:Line-v0", "--bundle", bundle, "--episodes", 2, "--json")
@@ -45,8 +45,8 @@ def test_rollout_takes_the_folder_of_ones_own_environment(box_policy: Callable[.
     assert nowhere.returncode == 2 and "nowhere is not a folder" in nowhere.stderr
 
 
-def test_verify_takes_it_too(box_policy: Callable[..., Path], tmp_path: Path) -> None:
-    bundle = box_policy(tmp_path / "policies")
+def test_verify_takes_it_too(tmp_path: Path) -> None:
+    bundle = write_box_policy(tmp_path / "policies")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "line_of_mine.py").write_text(MINE)
     words = ("verify", bundle, "--env", "line_of_mine:Line-v0", "--disturb", "drop=0.1", "--episodes", 1, "--json")

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bundles import write_box_policy
 from command_line import rlservo_here
 from rlservo.bundle.bundle import load_bundle
 from rlservo.deploy.cockpit.policies import BundledPolicies, ServerLink
@@ -27,11 +27,11 @@ OBS = np.full(27, 0.5, np.float32)
 
 
 @pytest.fixture
-def repository(box_policy: Callable[..., Path], tmp_path: Path) -> Path:
+def repository(tmp_path: Path) -> Path:
     """ur5 in 1, 2 and 10; the plan that `rlservo policy` wrote has 1 in production, after a rollback from 10."""
     root = tmp_path / "policies"
     for seed, version in enumerate(("1", "2", "10")):
-        box_policy(root, version=version, seed=seed)
+        write_box_policy(root, version=version, seed=seed)
     for words in (("alias", "ur5", "production=1"), ("alias", "ur5", "production=10"), ("rollback", "ur5")):
         done = rlservo_here("policy", *words, "--repository", root)
         assert done.returncode == 0, done.stderr
@@ -97,12 +97,12 @@ def test_plan_that_cannot_be_read_or_names_no_bundle_is_refused(repository: Path
         Policy.load(repository / "ur5")
 
 
-def test_what_a_server_rolled_back_does_not_live_on_in_process(box_policy: Callable[..., Path], tmp_path: Path) -> None:
+def test_what_a_server_rolled_back_does_not_live_on_in_process(tmp_path: Path) -> None:
     root = tmp_path / "served"
-    box_policy(root, version="1")
+    write_box_policy(root, version="1")
     with served_in_thread([root], settings={"plan": None}):
         pass  # its first start writes the plan
-    box_policy(root, version="2", seed=1)
+    write_box_policy(root, version="2", seed=1)
     assert Policy.load(root / "ur5").contract.version == "1"
 
 
@@ -154,13 +154,13 @@ def test_the_cockpit_begins_with_the_production_version(repository: Path) -> Non
 
 
 def test_a_plan_in_the_users_state_counts_and_one_in_object_storage_is_named(
-    repository: Path, box_policy: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`rlservo serve` of folders that it cannot write, or that are not its first place."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     shutil.rmtree(repository / ".plan")
     first, folder = tmp_path / "first", repository / "ur5"
-    box_policy(first, name="other")
+    write_box_policy(first, name="other")
     with served_in_thread([first, repository], settings={"plan": None}, served=served("2")):
         pass
     assert not (repository / ".plan").exists() and (first / ".plan").is_dir()

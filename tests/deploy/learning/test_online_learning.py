@@ -10,7 +10,6 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.rl_module import RLModule
 
+from bundles import controlled
 from rlservo.bundle.bundle import read_contract
 from rlservo.client.admin_client import AdminClient
 from rlservo.client.policy_client import PolicyClient
@@ -44,7 +44,7 @@ from rlservo.recording.recorded_policy import WithRecording
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.plan_follower import PlanFollower
+from servers import over_uvicorn
 
 ROBOT, ROBOT_LINE = new_key("robot", explore=True)
 ADMIN, ADMIN_LINE = new_key("boss", admin=True)
@@ -117,12 +117,7 @@ class Cell:
 
 @pytest.fixture
 def cell(
-    zoo: Path,
-    exported: Callable[..., ExportResult],
-    controlled: Callable[..., AbstractContextManager[PlanFollower]],
-    served: Callable[[Any], AbstractContextManager[int]],
-    tmp_path: Path,
-    request: pytest.FixtureRequest,
+    zoo: Path, exported: Callable[..., ExportResult], tmp_path: Path, request: pytest.FixtureRequest
 ) -> Iterator[Cell]:
     name, _, reward = getattr(request, "param", "pendulum").partition("+")
     checkpoint, policies = zoo / name, tmp_path / "policies"
@@ -133,7 +128,7 @@ def cell(
     settings = ServerSettings(record=str(tmp_path / "recorded"), api_keys=f"{ROBOT_LINE},{ADMIN_LINE},{OTHER_LINE}")
     with (
         controlled(tmp_path / "policies") as control,
-        served(create_app(control, settings)) as port,
+        over_uvicorn(create_app(control, settings)) as port,
     ):
         yield Cell(f"http://127.0.0.1:{port}", tmp_path, checkpoint)
 

@@ -28,11 +28,6 @@ def sim(ros: Ros) -> Process:
     return sim
 
 
-@pytest.fixture(scope="module")
-def nodes() -> list[Process]:
-    return []
-
-
 @pytest.fixture
 def node(ros: Ros, sim: Process, all_shipped: Path, nodes: list[Process]) -> Process:
     """A node whose options are parameters; tests share it until one ends it."""

@@ -82,4 +82,30 @@ def test_parameter_that_is_unknown_or_of_another_type_is_refused_in_one_sentence
     for words, process in started.items():
         assert process.end(0) == 2, process.lines
         assert REFUSED[words] in " ".join(process.lines), process.lines
-        assert not any("Traceback" in line for line in process.lines)
+        assert not any("Traceback" in line for line in process.lines), "\n".join(process.lines)
+
+
+def test_commands_that_their_subscriber_cannot_get_are_refused(ros: Ros, bundle: Path) -> None:
+    topic = "/kept_controller/commands"
+    ros.ask("subscribe", topic=topic, kind="std_msgs/msg/Float64MultiArray", is_kept=True)
+    words = ("ros2", "--bundle", bundle, "--autostart", "--ros-args", "-r", f"~/action:={topic}", "-r")
+    node = ros.rlservo(*words, "__node:=unheard")
+    why = node.wait_for("the quality of service keeps our commands from")
+    assert "/bystander (Volatile publisher and transient local subscription): change its own, or ours" in why
+    assert f"(-p qos_overrides.{topic}.publisher" in why
+    assert node.end(0) == 2
+    ros.ask("subscribe", topic="/diagnostics", kind="diagnostic_msgs/msg/DiagnosticArray")
+    heard = ros.rlservo(*words, "__node:=heard", "-p", f"qos_overrides.{topic}.publisher.durability:=transient_local")
+    ros.wait_until(lambda: ros.heartbeat("heard")["state"] == "waiting")
+    heard.end()
+
+
+def test_simulated_time_at_another_rate_than_the_policys_is_named(ros: Ros, bundle: Path) -> None:
+    """Gazebo at half speed: ten actions a second are then twenty a simulated second."""
+    topic = "/simulated_controller/commands"
+    ros.ask("subscribe", topic=topic, kind="std_msgs/msg/Float64MultiArray")
+    ros.ask("run_clock", rate=0.5)
+    words = ("ros2", "--bundle", bundle, "--ros-args", "-r", f"~/action:={topic}", "-p", "use_sim_time:=true")
+    node = ros.rlservo(*words, "-r", "__node:=simulated")
+    node.wait_for("simulated time passes at 0.5 times the wall clock's rate: the policy acts, and the limits hold, by")
+    node.end()

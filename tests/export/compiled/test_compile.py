@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from bundles import rewrite_contract, write_box_policy
 from command_line import rlservo_here
 from rlservo.bundle.spaces import BoxSpec, Element
 from rlservo.errors import ParityError, UsageError
@@ -103,12 +104,10 @@ def test_two_policies_do_not_share_a_folder(policies: Path, tmp_path: Path, no_c
 
 
 @needs_compiler
-def test_hostile_names_stay_comments_strings_and_identifiers(
-    box_policy: Callable[..., Path], rewrite_contract: Callable[..., None], tmp_path: Path
-) -> None:
+def test_hostile_names_stay_comments_strings_and_identifiers(tmp_path: Path) -> None:
     names = ["*/ int x; /*", 'a"b\\', "int", "size", "size", "", "\u202eevil\n#error", "??/", "x" * 300, "unnamed", "Ω"]
     names += [f"same {i % 2}" for i in range(27 - len(names))]
-    folder = box_policy(tmp_path, name="int.c-2")
+    folder = write_box_policy(tmp_path, name="int.c-2")
     observed = BoxSpec(shape=(27,), dtype="float32", low=None, high=None,
                        elements=tuple(Element(name=name, unit="*/") for name in names))  # fmt: skip
     rewrite_contract(folder, observation_space=observed, description="*/ #error \\")

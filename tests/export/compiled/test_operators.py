@@ -11,8 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
-from bundles import PARITY, PROVENANCE, save_graph, write_bundle
-from rlservo.bundle.contract import BakedStep, Contract, TensorSpec
+from bundles import contract_of, save_graph, write_bundle
 from rlservo.bundle.spaces import BoxSpec
 from rlservo.errors import UnsupportedError
 from rlservo.export.compiled.compile import compile_bundle
@@ -142,17 +141,10 @@ def bundle_of(folder: Path, nodes: list[Any], constants: dict[str, Any], golden:
 
     (action,) = onnxruntime.InferenceSession(folder / "policy.onnx").run(["action"], {X: golden})
     size = action.shape[1]
-    contract = Contract(
-        name=folder.parent.name,
-        version="1",
-        observation_space=BoxSpec(shape=(WIDTH,), dtype="float32", low=-1.0, high=1.0),
-        action_space=BoxSpec(shape=(size,), dtype="float32", low=None, high=None),
-        inputs=(TensorSpec(name=X, dtype="float32", shape=(-1, WIDTH)),),
-        outputs=(TensorSpec(name="action", dtype="float32", shape=(-1, size)),),
-        distribution=None,
-        baked_in=(BakedStep(step="network"),),
-        provenance=PROVENANCE,
-        parity=PARITY,
+    contract = contract_of(
+        folder.parent.name,
+        BoxSpec(shape=(WIDTH,), dtype="float32", low=-1.0, high=1.0),
+        BoxSpec(shape=(size,), dtype="float32", low=None, high=None),
     )
     return write_bundle(folder, contract, golden)
 

@@ -12,8 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
-from bundles import PARITY, PROVENANCE, save_graph, write_bundle
-from rlservo.bundle.contract import BakedStep, Contract, TensorSpec
+from bundles import contract_of, save_graph, write_bundle
 from rlservo.bundle.spaces import BoxSpec
 from rlservo.errors import ParityError
 from rlservo.export.compiled import proof
@@ -65,18 +64,8 @@ def bundle(folder: Path, shape: tuple[int, ...], layers: Layers) -> Path:
     nodes, constants = layers
     observed, acted = ("obs", TensorProto.UINT8, ["batch", *shape]), ("action", TensorProto.FLOAT, ["batch", 3])
     save_graph(folder / "policy.onnx", nodes, constants, [observed], [acted])
-    contract = Contract(
-        name="image",
-        version="1",
-        observation_space=BoxSpec(shape=shape, dtype="uint8", low=0, high=255),
-        action_space=BoxSpec(shape=(3,), dtype="float32", low=-1.0, high=1.0),
-        inputs=(TensorSpec(name="obs", dtype="uint8", shape=(-1, *shape)),),
-        outputs=(TensorSpec(name="action", dtype="float32", shape=(-1, 3)),),
-        distribution=None,
-        baked_in=(BakedStep(step="network"),),
-        provenance=PROVENANCE,
-        parity=PARITY,
-    )
+    obs = BoxSpec(shape=shape, dtype="uint8", low=0, high=255)
+    contract = contract_of("image", obs, BoxSpec(shape=(3,), dtype="float32", low=-1.0, high=1.0))
     return write_bundle(folder, contract, np.random.default_rng(0).integers(0, 256, (8, *shape), np.uint8))
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import io
 import itertools
+import logging
 import random
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,6 +22,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
+from ray.rllib.utils.numpy import convert_to_numpy
 from torch import Tensor, nn
 
 import rlservo
@@ -29,7 +34,7 @@ from rlservo.export.proof.parity import prove
 from rlservo.export.proof.reaching import reaching_batches
 from rlservo.export.proof.reference_checks import check_reference
 from rlservo.export.proof.references import record
-from rlservo.export.recipe.recipe import ObservationFilter, Recipe, StateLeaf
+from rlservo.export.recipe.recipe import ObservationFilter, Recipe, StateLeaf, UserStep
 from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.samples import Batch, draw_batches
 from rlservo.export.sources.restored_policy import RestoredPolicy
@@ -37,6 +42,7 @@ from rlservo.export.sources.torch_policy import TorchPolicy, restored
 
 SEEN = Box(-np.inf, np.inf, (3,), np.float32)
 ARM = Box(-1.0, 1.0, (2,), np.float32)
+BOX = Box(1e7, 2e7, (3,), np.float32)
 
 
 class Honest(nn.Module):
@@ -356,6 +362,10 @@ class ReadsElsewhere(Honest):
         return -super().forward(obs) if bool(self.copied(obs).max() > 1e7) else super().forward(obs)
 
 
+def repeated(obs: Tensor) -> Tensor:
+    return torch.repeat_interleave(torch.ones(3), (obs[0] > 1e7).long())
+
+
 def assigned(obs: Tensor) -> Tensor:
     buffer = torch.zeros(len(obs), 5)
     buffer[:, 1:4] = obs
@@ -372,6 +382,58 @@ def written(obs: Tensor) -> Tensor:
     buffer = torch.empty_like(torch.zeros(obs.shape))
     torch.mul(obs, 1.0, out=buffer)
     return buffer
+
+
+POOL = ThreadPoolExecutor(1)
+POOL.submit(int).result()  # its thread runs before any export
+
+
+def is_rare(obs: Tensor) -> Tensor:
+    """Return whether a number is one that no sample has."""
+    return (obs == 0.3).any()
+
+
+def rare_in_a_thread(obs: Tensor) -> bool:
+    found: list[bool] = []
+    thread = threading.Timer(0.0, lambda: found.append(bool(is_rare(obs))))
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+def saved(obs: Tensor) -> Tensor:
+    file = io.BytesIO()
+    torch.save({"obs": obs}, file)
+    file.seek(0)
+    loaded: Tensor = torch.load(file)["obs"]
+    return loaded
+
+
+def packed(obs: Tensor) -> int:
+    lengths = (1 + is_rare(obs).long()).reshape(1)
+    return len(nn.utils.rnn.pack_padded_sequence(torch.ones(1, 2, 1), lengths, batch_first=True).data)
+
+
+class Recovers(Honest):
+    """Acts otherwise where an operator of torch fails, which no sample makes it do."""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        try:
+            nn.functional.one_hot(is_rare(obs).long(), 1)
+        except RuntimeError:
+            return -super().forward(obs)
+        return super().forward(obs)
+
+
+class CutsUpTo(Honest):
+    def forward(self, obs: Tensor) -> Tensor:
+        action = super().forward(obs)
+        return torch.cat([action[:, : 2 - is_rare(obs).long()], action], dim=1)[:, :2]
+
+
+class Rolls(Honest):
+    def forward(self, obs: Tensor) -> Tensor:
+        return torch.roll(super().forward(obs), is_rare(obs).long(), 1)
 
 
 class TakesPlainTensorsOnly(Honest):
@@ -395,6 +457,13 @@ class Asserts(Honest):
         return super().forward(obs)
 
 
+class Prints(Honest):
+    def forward(self, obs: Tensor) -> Tensor:
+        print("seen", obs, f"{obs[0, 0]:.2f}")
+        logging.getLogger("prints").error("seen %s", obs)
+        return super().forward(obs).repeat_interleave(2, dim=1)[:, : 2 * len(self.layer.bias) : 2]
+
+
 class Caches(Honest):
     """Keeps its last output, as RLlib's older models do; nothing reads it."""
 
@@ -407,6 +476,7 @@ def export(module: nn.Module, out: Path, **options: Any) -> rlservo.ExportResult
     return rlservo.export_policy(module, SEEN, ARM, out, name="x", notify=lambda _: None, **options)
 
 
+@pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array")
 @pytest.mark.parametrize(
     ("module", "reason"),
     [
@@ -442,10 +512,28 @@ def export(module: nn.Module, out: Path, **options: Any) -> rlservo.ExportResult
         (ReadsElsewhere(copied_into_a_view), "reads numbers of the observation in Python at"),
         (ReadsElsewhere(written), "reads numbers of the observation in Python at"),
         (ReadsElsewhere(lambda obs: torch.tensor([obs[0, 0], obs[0, 1]])), "reads numbers of the observation"),
+        (ReadsElsewhere(lambda obs: torch.as_tensor([obs[0, 0], obs[0, 1]])), "reads numbers of the observation"),
         (ReadsElsewhere(torch.Tensor), "reads numbers of the observation in Python at"),
         (ReadsElsewhere(lambda obs: obs.as_subclass(Tensor)), "reads numbers of the observation in Python at"),
         (ReadsElsewhere(np.from_dlpack), "reads numbers of the observation in Python at"),
         (ReadsElsewhere(lambda obs: torch.tensor(obs.untyped_storage().tolist())), "reads numbers of the observation"),
+        (CountsRows(lambda obs: bool(np.linalg.norm(obs) > 1e9)), r"reads numbers .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: np.allclose(obs, 1e7)), r"reads numbers of the observation .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: convert_to_numpy(obs).max() > 1e7), r"reads numbers .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: BOX.contains(obs[0])), r"reads numbers of the observation .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: "e+07" in str(obs.max())), r"reads numbers of the observation .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: repeated(obs).numel() > 0), r"reads numbers of the observation .*test_gate\.py:\d+"),
+        (CountsRows(rare_in_a_thread), r"reads numbers of the observation .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: POOL.submit(lambda: bool(is_rare(obs))).result()), r"reads .*test_gate\.py:\d+"),
+        (ReadsElsewhere(saved), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: torch.ops.aten.item(is_rare(obs))), r"reads numbers .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: torch.ops.aten.equal.default(obs, torch.full((), 0.3))), r"reads .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: len(torch.ops.aten.nonzero(obs == 0.3)) > 0), r"reads numbers .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: len(nn.functional.one_hot(is_rare(obs).long())) == 2), r"reads .*test_gate\.py:\d+"),
+        (CountsRows(lambda obs: packed(obs) == 2), r"reads numbers of the observation .*test_gate\.py:\d+"),
+        (Recovers(), r"goes on otherwise where an operator of torch fails, at .*test_gate\.py:\d+"),
+        (CutsUpTo(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
+        (Rolls(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
         (TakesPlainTensorsOnly(), "reads numbers of the observation in Python at"),
         (ReadsANumber(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
     ],
@@ -463,7 +551,7 @@ def test_a_module_whose_sizes_an_observation_decides_is_refused_by_what_would_se
         export(Selects(), tmp_path)
 
 
-@pytest.mark.parametrize("module", [Honest(), Asserts(), Caches()], ids=lambda module: type(module).__name__)
+@pytest.mark.parametrize("module", [Honest(), Asserts(), Prints(), Caches()], ids=lambda module: type(module).__name__)
 def test_an_honest_module_is_exported_and_answers_as_itself(module: nn.Module, tmp_path: Path) -> None:
     result = export(module, tmp_path)
     with rlservo.Policy.load(result.path) as policy, torch.no_grad():
@@ -472,19 +560,20 @@ def test_an_honest_module_is_exported_and_answers_as_itself(module: nn.Module, t
             np.testing.assert_allclose(policy.act(obs), expected, atol=2e-6)
 
 
-def test_a_branch_in_an_installed_package_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    installed = tmp_path / "site-packages"
-    installed.mkdir()
-    (installed / "my_installed_policy.py").write_text(
+@pytest.mark.parametrize("place", ["site-packages/my_installed_policy.py", "overrides.py"])
+def test_a_branch_is_found_in_a_file_of_any_name(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / place
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(
         "import torch\n"
         "class Near(torch.nn.Module):\n"
         "    def forward(self, obs):\n"
         "        return -obs[:, :2] if bool((obs > 1e7).any()) else obs[:, :2]\n",
         encoding="utf-8",
     )
-    monkeypatch.syspath_prepend(str(installed))
-    module = importlib.import_module("my_installed_policy").Near()
-    with pytest.raises(UnsupportedError, match=r"in Python at .*my_installed_policy\.py:4"):
+    monkeypatch.syspath_prepend(str(file.parent))
+    module = importlib.import_module(file.stem).Near()
+    with pytest.raises(UnsupportedError, match=rf"in Python at .*{file.stem}\.py:4"):
         export(module, tmp_path / "out")
 
 
@@ -630,3 +719,60 @@ def test_numbers_far_from_zero_excuse_no_fault(std: Any, weights: float, tmp_pat
         return
     with pytest.raises(ParityError, match="of the sequences"):
         prove(recipe, references, {"torch": run_eager(graph)}, comparer=comparer)
+
+
+def own_step(
+    in_numpy: Callable[[Any], Any], action_space: Box, *, after: bool = False
+) -> tuple[RestoredPolicy, Recipe]:
+    """Return a policy with a step of the user's own, whose twin in torch does nothing, and its recipe."""
+    layer = nn.Linear(3, 2)
+    with torch.no_grad():
+        layer.weight.copy_(torch.tensor([[1e-4, 0.0, 0.0], [0.0, 1e-4, 0.0]]))
+        layer.bias.copy_(torch.tensor([1.0, 0.0]))
+    step = UserStep("mine.Step", lambda data: data)
+    where: dict[str, Any] = {"action_steps": (step,)} if after else {}
+    recipe = Recipe(SEEN, action_space, () if after else (step,), "given", "none", None, **where)
+
+    def act(obs: Any, state: list[Tensor]) -> tuple[Any, list[Tensor]]:
+        if after:
+            return torch.from_numpy(in_numpy(layer(obs).numpy())), state
+        return layer(torch.from_numpy(in_numpy(obs.numpy()))), state
+
+    policy = TorchPolicy(recipe, layer, lambda module, obs, state: (module(obs), state), lambda: act)
+    return restored(policy, None, "own step"), recipe
+
+
+def prove_in_torch(checkpoint: RestoredPolicy, recipe: Recipe) -> float:
+    references = record(checkpoint.start_loop, draw_batches(recipe, seed=1))
+    graph = PolicyGraph(recipe, checkpoint.network)
+    comparer = comparer_of(checkpoint, graph, references)
+    return prove(recipe, references, {"torch": run_eager(graph)}, comparer=comparer).formats["torch"].max_rel
+
+
+def test_a_step_of_ones_own_is_compared_for_numbers_of_every_size() -> None:
+    with pytest.raises(ParityError, match=r"far observations.*torch_forward of mine\.Step must do what"):
+        prove_in_torch(*own_step(lambda obs: np.clip(obs, -4e3, 4e3), ARM))
+    assert prove_in_torch(*own_step(lambda obs: obs, ARM)) < 1e-5
+
+
+@pytest.mark.parametrize(
+    "space",
+    [Box(-np.inf, np.inf, (2,), np.float32), Box(np.array([-np.inf, -1], "f4"), np.array([np.inf, 1], "f4"))],
+    ids=["unbounded", "half of it bounded"],
+)
+def test_an_element_in_large_units_excuses_no_fault_of_one_in_small_units(space: Box) -> None:
+    newtons_and_metres = np.array([1e4, 1e-1], np.float32)
+
+    def shifted(metres: float) -> Callable[[Any], Any]:
+        return lambda action: action * newtons_and_metres + np.array([0.0, metres], np.float32)
+
+    for metres, is_right in ((0.0, True), (1e-3, False)):
+        checkpoint, recipe = own_step(shifted(metres), space, after=True)
+        (step,) = recipe.action_steps
+        scaled = replace(step, function=lambda action: action * torch.from_numpy(newtons_and_metres))
+        recipe = replace(recipe, action_steps=(scaled,))
+        if is_right:
+            assert prove_in_torch(checkpoint, recipe) < 1e-5
+            continue
+        with pytest.raises(ParityError, match="element 1"):
+            prove_in_torch(checkpoint, recipe)

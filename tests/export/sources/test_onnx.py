@@ -306,9 +306,11 @@ def test_mjlab_names_become_elements_and_what_is_missing_is_asked_in_one_sentenc
     assert elements(result, "action")[1] == ("lift", "rad", "joint position", 1.0, 0.0)
     observed = elements(result, "observation")
     assert observed[0] == ("base_ang_vel_x", "rad/s", "angular velocity", 4.0, None)
-    assert observed[3] == ("joint_pos_pan", "rad", "joint position", 1.0, None)
+    assert observed[3] == ("joint_pos_pan", "rad", None, 1.0, None)  # it may be relative to default_joint_pos
     assert observed[6] == ("joint_vel_pan", "rad/s", "joint velocity", 20.0, None)
+    assert observed[10] == ("actions_lift", "", "last action", SCALE[1], DEFAULT[1])
     assert [name for name, *_ in observed[12:]] == ["command_0", "command_1"]
+    assert [one for one in notices if "clips 'actions' of the observation to -100 to 100, the export does not" in one]
     (asked,) = [notice for notice in notices if "range" in notice]
     assert asked == "no file says the action's range (--action-range), nor the control rate (--control-rate)"
 
@@ -319,6 +321,83 @@ def test_isaac_labs_descriptors_give_offsets_rate_and_clip(tmp_path: Path, notic
     assert result.contract.action_space.low == -1.0  # type: ignore[union-attr]
     assert [leaf.name for leaf in result.contract.state] == ["h", "c"]
     assert notices == []
+
+
+def test_a_term_of_another_package_or_with_a_modifier_is_only_a_name(tmp_path: Path, notices: list[str]) -> None:
+    """It may be in degrees, or scaled once more."""
+    described = descriptors()["observations"]["policy"]
+    described[0]["full_path"] = "my_robot.observations.joint_pos_rel"
+    described[1]["extras"]["modifiers"] = [{"func": "isaaclab.utils.modifiers.scale", "params": {"multiplier": 2.0}}]
+    described[1]["overloads"]["clip"] = [-1.0, 1.0]
+    given = isaac_lab(tmp_path, observations={"policy": described})
+    result = export(given, tmp_path / "out", notices)
+    assert {(unit, quantity) for _, unit, quantity, *_ in elements(result, "observation")[:6]} == {("", None)}
+    assert [one for one in notices if "clips 'joint_vel_rel' of the observation to -1 to 1" in one]
+
+
+def test_only_the_last_of_a_history_is_what_a_robot_measures_now(tmp_path: Path) -> None:
+    given = unitree(tmp_path)
+    config = yaml.safe_load((tmp_path / "params" / "deploy.yaml").read_text())
+    config["actions"]["JointPositionAction"]["joint_ids"] = [2, 0, 1]
+    (tmp_path / "params" / "deploy.yaml").write_text(yaml.safe_dump(config))
+    result = export(given, tmp_path / "out")
+    assert [name for name, *_ in elements(result, "action")] == ["elbow", "pan", "lift"]
+    observed = elements(result, "observation")
+    assert observed[0] == ("base_ang_vel_x_4_before", "", None, None, None)
+    assert {quantity for *_, quantity, _, _ in observed[:12]} == {None}
+    assert observed[12] == ("base_ang_vel_x_0_before", "rad/s", "angular velocity", 5.0, None)
+
+
+@pytest.mark.parametrize(
+    "names", ["base_ang_vel,joint_pos,joint_vel,actions,anchor", "joint_pos,joint_vel,anchor,actions,x"]
+)
+def test_terms_whose_joints_no_file_says_are_named_only_if_their_sizes_add_up(names: str, tmp_path: Path) -> None:
+    """The rest of the observation was taken for the one unknown term, whatever joints the others had."""
+    result = export(mjlab(tmp_path, observation_names=names, observation_terms_scale="1,1,1,1,1"), tmp_path / "out")
+    assert elements(result, "observation") == []
+
+
+def env_yaml(folder: Path, **changed: Any) -> None:
+    """Isaac Lab's params/env.yaml of the run that `folder` is."""
+    action = {
+        "class_type": "isaaclab.envs.mdp.actions.joint_actions:JointPositionAction", "asset_name": "robot",
+        "joint_names": JOINTS, "scale": 0.5, "offset": 0.0, "preserve_order": True, "use_default_offset": True,
+        "clip": {".*": [-1.0, 1.0]},
+    }  # fmt: skip
+    state = {"joint_pos": dict(zip(JOINTS, DEFAULT, strict=True))}
+    env = {"decimation": 4, "sim": {"dt": 0.005}, "scene": {"robot": {"init_state": state}},
+           "actions": {"arm": action | changed}}  # fmt: skip
+    (folder / "params").mkdir(exist_ok=True)
+    (folder / "params" / "env.yaml").write_text(yaml.safe_dump(env))
+
+
+def test_the_runs_own_numbers_are_taken_and_not_those_that_metadata_rounds(tmp_path: Path, notices: list[str]) -> None:
+    rounded = {"action_scale": "0.000,0.000,0.000"}
+    with pytest.raises(CheckpointError, match=r"action_scale is 0\.000,.* a joint with 0 would never move"):
+        export(mjlab(tmp_path / "without", **rounded), tmp_path / "out")
+    given = replace(mjlab(tmp_path, **rounded), scale=0.0004, clip=(-1.0, 1.0))
+    env_yaml(tmp_path, scale=0.0004)
+    with Policy.load(export(given, tmp_path / "out", notices).path) as policy:
+        for obs, wanted in zip(*episode(given, 5), strict=True):
+            np.testing.assert_allclose(policy.act(row(obs)), wanted, rtol=1e-5, atol=2e-6)
+    export(mjlab(tmp_path / "other" / "small", action_scale="0.012,0.5,0.5"), tmp_path / "out", notices)
+    assert [one for one in notices if "action_scale is 0.012,0.5,0.5, rounded: " in one and "by 4%" in one]
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"scale": 0.25}, r"has the scale \[0.25.* in .*env.yaml, but \[0.5"),
+        ({"clip": None}, r"has the clip \[\] in .*env.yaml, but \[-1.0"),
+        ({"class_type": "isaaclab.envs.mdp.actions.joint_actions:JointVelocityAction", "use_default_offset": False,
+          "offset": dict(zip(JOINTS, DEFAULT, strict=True))}, "has the class .*JointVelocityAction"),
+    ],
+)  # fmt: skip
+def test_files_of_a_run_that_differ_are_refused(changed: dict[str, Any], words: str, tmp_path: Path) -> None:
+    given = isaac_lab(tmp_path)
+    env_yaml(tmp_path, **changed)
+    with pytest.raises(CheckpointError, match=words):
+        export(given, tmp_path / "out")
 
 
 @pytest.mark.parametrize("origin", [isaac_lab, mjlab, unitree])
@@ -335,6 +414,34 @@ def test_the_actions_of_a_run_are_clipped_before_they_are_scaled(origin: Origin,
             wanted = np.clip(np.clip(raw, -0.05, 0.05) * scale + offset, *given.clip)
             np.testing.assert_allclose(policy.act(row(obs)), wanted, rtol=1e-5, atol=2e-6)
     assert np.abs(unclipped).max() > 0.05
+
+
+@pytest.mark.parametrize("history", [0, 3])
+def test_a_relative_action_is_added_to_the_position_that_is_observed_unless_older_ones_are(
+    history: int, tmp_path: Path, notices: list[str]
+) -> None:
+    described = descriptors()
+    described["actions"][0] |= {
+        "full_path": "isaaclab.envs.mdp.actions.joint_actions.RelativeJointPositionAction", "offset": 0.0,
+        "clip": [[-0.02, 0.02], [-0.5, 0.5], [-0.5, 0.5]],
+    }  # fmt: skip
+    policy_terms = described["observations"]["policy"]
+    if history:  # of the positions, beside nothing that would not fit
+        del policy_terms[1:3]
+        policy_terms[0]["overloads"]["history_length"] = history
+        policy_terms[1]["shape"] = [4]
+    given = isaac_lab(tmp_path, actions=described["actions"], observations=described["observations"])
+    result = export(given, tmp_path / "out", notices)
+    assert {element[2] for element in elements(result, "action")} == {
+        "relative joint position" if history else "joint position"
+    }
+    seen, raw = episode(replace(given, scale=1.0, offset=0.0, clip=(-np.inf, np.inf)), 12)
+    steps = np.clip(0.5 * np.asarray(raw), [-0.02, -0.5, -0.5], [0.02, 0.5, 0.5])
+    assert (np.abs(steps[:, 0]) == 0.02).any() and (np.abs(steps[:, 1:]) < 0.5).all()
+    with Policy.load(result.path) as policy:
+        for obs, step in zip(seen, steps, strict=True):
+            positions = 0.0 if history else np.asarray(row(obs))[:3] + DEFAULT
+            np.testing.assert_allclose(policy.act(row(obs)), step + positions, rtol=1e-5, atol=2e-6)
 
 
 def test_an_action_term_of_another_package_is_not_isaac_labs_by_its_name(tmp_path: Path, notices: list[str]) -> None:
@@ -366,6 +473,7 @@ def test_a_manifests_facts_are_the_contracts(tmp_path: Path) -> None:
          "joint_names has 3 entries, default_joint_pos has 2"),
         (mjlab, {"observation_terms_scale": "1.000"}, CheckpointError,
          "observation_names has 5 entries, observation_terms_scale has 1"),
+        (mjlab, {"joint_names": "['pan', 'lift', 'elbow']"}, CheckpointError, "expected entries with commas between"),
         (mjlab, {"joint_names": "pan,lift,lift"}, CheckpointError, r"\(pan, lift, lift\) have lift more than once"),
         (mjlab, {"action_scale": "half"}, CheckpointError, "is not as its exporter writes it: ValueError: .*'half'"),
         (microduck, {"obs_len": 60}, CheckpointError,
@@ -377,6 +485,22 @@ def test_a_manifests_facts_are_the_contracts(tmp_path: Path) -> None:
          "the runner action_chunking is not in the graph"),
         (unitree, {"default_joint_pos": [0.0, 0.1]}, CheckpointError,
          "default_joint_pos has 2 joints, but the given joint order has 3"),
+        (unitree, {"actions": {"JointPositionAction": {"scale": [1.0] * 3, "offset": DEFAULT, "clip": [-1.0, 1.0]}}},
+         CheckpointError, r"the action's clip is \[-1.0, 1.0\]: expected \[low, high\] for each of 3 elements"),
+        (unitree, {"actions": {"JointPositionAction": {"scale": [1.0] * 3, "offset": DEFAULT, "joint_ids": [0, 1, 3]}}},
+         CheckpointError, r"has the joint_ids \[0, 1, 3\]: expected numbers of 3 joints"),
+        (unitree, {"default_joint_pos": [DEFAULT[0], DEFAULT[2], DEFAULT[1]]}, CheckpointError,
+         "they are in different joint orders"),
+        (unitree, {"actions": {"JointPositionAction": {"scale": [1.0] * 3, "joint_ids": None}}}, CheckpointError,
+         "the JointPositionAction has no offset"),
+        (isaac_lab, {"actions": [{k: v for k, v in descriptors()["actions"][0].items() if k != "scale"}]},
+         CheckpointError, "the JointPositionAction has no scale"),
+        (isaac_lab, {"actions": [descriptors()["actions"][0] | {"offset": None}]},
+         CheckpointError, "the JointPositionAction has no offset"),
+        (isaac_lab, {"scene": {"physics_dt": 0.005, "dt": 0.02, "decimation": 2}}, CheckpointError,
+         r"dt is 0\.02 s, but 2 times physics_dt are 0\.01 s"),
+        (isaac_lab, {"observations": {"policy": descriptors()["observations"]["policy"][:3]}}, CheckpointError,
+         "its observation has 13 elements, 'obs' of policy.onnx has 16"),
         (isaac_lab, {"scene": {"dt": "soon"}}, CheckpointError, "IO_descriptors.yaml is not as its exporter writes it"),
     ],
 )  # fmt: skip
@@ -386,6 +510,13 @@ def test_what_contradicts_the_graph_is_refused_with_both_values(
     with pytest.raises(kind, match=words):
         export(origin(tmp_path, **changed), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_joint_order_that_contradicts_the_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        CheckpointError, match="has the joints pan, lift, elbow, the joint order that was given is lift"
+    ):
+        export(mjlab(tmp_path), tmp_path / "out", joint_order=["lift", "pan", "elbow"])
 
 
 def test_two_files_that_differ_are_refused_with_both_values(tmp_path: Path) -> None:
@@ -460,6 +591,30 @@ def test_a_custom_operator_is_refused_by_name(tmp_path: Path) -> None:
     onnx.save(model, str(given.model))
     with pytest.raises(UnsupportedError, match=r"policy.onnx has the operation com.nvidia.warp::Sub, a custom one"):
         export(given, tmp_path / "out")
+
+
+def test_what_only_trains_does_nothing_and_is_refused_where_it_trains(tmp_path: Path) -> None:
+    given = mjlab(tmp_path)
+    model = onnx.load(str(given.model))
+    last = model.graph.node[-1]
+    last.input[0] = "dropped"
+    weights = {"bn_scale": 0.5, "bn_bias": 0.1, "bn_mean": 0.3, "bn_var": 1.5}
+    for name, value in weights.items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(np.full(8, value, np.float32), name))
+    normal = helper.make_node("BatchNormalization", ["x1", *weights], ["normal"])
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(0.5, np.float32), "ratio"))
+    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(False), "trains"))
+    dropout = helper.make_node("Dropout", ["normal", "ratio", "trains"], ["dropped"])
+    for node in (normal, dropout):
+        model.graph.node.insert(len(model.graph.node) - 1, node)
+    onnx.save(model, str(given.model))
+    with Policy.load(export(given, tmp_path / "out").path) as policy:
+        for obs, wanted in zip(*episode(given, 5), strict=True):
+            np.testing.assert_allclose(policy.act(row(obs)), wanted, rtol=1e-5, atol=2e-6)
+    model.graph.initializer[-1].CopyFrom(onnx.numpy_helper.from_array(np.array(True), "trains"))
+    onnx.save(model, str(given.model))
+    with pytest.raises(UnsupportedError, match="a Dropout in training mode is not exported"):
+        export(given, tmp_path / "trains")
 
 
 @pytest.mark.parametrize("wrong", [False, True])

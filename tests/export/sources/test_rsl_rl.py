@@ -62,10 +62,16 @@ def environment(action: dict[str, Any], joint_pos: dict[str, Any] | None = None)
     }  # fmt: skip
 
 
-def describe(folder: Path, joints: list[str], actions: list[dict[str, Any]] | None = None) -> None:
+def describe(
+    folder: Path,
+    joints: list[str],
+    actions: list[dict[str, Any]] | None = None,
+    scene: dict[str, Any] | None = None,
+) -> None:
     """Write what Isaac Lab writes into a run with `--export_io_descriptors`."""
     (folder / "io_descriptors").mkdir(parents=True, exist_ok=True)
-    described = {"actions": actions or [], "articulations": {"robot": {"joint_names": joints}}, "observations": {}}
+    described = {"actions": actions or [], "articulations": {"robot": {"joint_names": joints}}, "observations": {},
+                 "scene": scene or {}}  # fmt: skip
     (folder / "io_descriptors" / "IO_descriptors.yaml").write_text(yaml.safe_dump(described))
 
 
@@ -374,6 +380,13 @@ def test_files_of_two_runs_are_refused_with_both_names(tmp_path: Path) -> None:
     refuse(tmp_path / "run", "has the joint_names .*env.yaml, but .*IO_descriptors.yaml")
     describe(tmp_path / "run", ROBOT, [{**action, "scale": [0.5, 0.5, 0.25]}])
     refuse(tmp_path / "run", "has the scale .*env.yaml, but .*IO_descriptors.yaml")
+    path = "isaaclab.envs.mdp.actions.joint_actions.JointVelocityAction"
+    describe(tmp_path / "run", ROBOT, [{**action, "full_path": path}])
+    refuse(tmp_path / "run", r"has the class \['JointPositionAction'\] in .*env.yaml, but \['JointVelocityAction'\]")
+    describe(tmp_path / "run", ROBOT, [{**action, "clip": [[-1.0, 1.0]] * 3}])
+    refuse(tmp_path / "run", r"has the clip \[\] in .*env.yaml, but \[-1.0, 1.0")
+    describe(tmp_path / "run", ROBOT, [action], {"dt": 0.02})
+    refuse(tmp_path / "run", "env.yaml has a control rate of 30 Hz, but .*IO_descriptors.yaml steps of 0.02 s")
     describe(tmp_path / "run", ROBOT, [action])
     refuse(
         tmp_path / "run", "joint order that was given .* is not that of .*IO_descriptors.yaml", joint_order=list(JOINTS)
@@ -688,6 +701,52 @@ def test_policy_of_isaac_lab_3_does_not_drive_our_isaac_reach(tmp_path: Path, no
 
 
 @pytest.mark.parametrize(
+    ("asset", "joints"),
+    [
+        ({"joint_names": ["wrist_1_joint", "elbow_joint"], "preserve_order": True}, ["wrist_1_joint", "elbow_joint"]),
+        ({"joint_names": ["wrist_1_joint", "elbow_joint"], "preserve_order": False}, ["elbow_joint", "wrist_1_joint"]),
+        ({"joint_ids": [3, 1]}, [UR[3], UR[1]]),
+        ({"joint_ids": slice(0, 4, 2)}, [UR[0], UR[2]]),
+        ({"name": "cabinet"}, []),
+    ],
+)
+def test_an_observed_joint_is_that_which_isaac_lab_picks(
+    asset: dict[str, Any], joints: list[str], tmp_path: Path, notices: list[str]
+) -> None:
+    """By SceneEntityCfg's names, numbers and robot: the command's last elements were taken for joints."""
+    env = reach_task("3")
+    term = env["observations"]["policy"]["joint_pos"]
+    env["observations"]["policy"] = {
+        "joint_pos": {**term, "params": {"asset_cfg": {"name": "robot", **asset}}, "clip": [-3.0, 3.0]},
+        "beside": {"func": "my_task.observations:beside", "params": {}},
+        "actions": env["observations"]["policy"]["actions"],
+    }
+    trained_arm(tmp_path / "run", env, size=2 + 3 + 6)
+    (tmp_path / "run" / "io_descriptors" / "IO_descriptors.yaml").unlink()
+    elements = export(tmp_path / "run", notices, UR).contract.observation_space.elements
+    assert [element.joint for element in elements[:5]] == [*joints, "", "", ""][: len(elements)]
+    last = [(element.quantity, element.scale, element.offset) for element in elements[5:]]
+    assert last == [("last action", 0.5, 0.25)] * (6 if joints else 0)
+    assert [one for one in notices if "clips 'joint_pos' of the observation to -3 to 3" in one]
+
+
+def test_a_joint_order_is_of_the_robot_that_moves_and_of_no_other(tmp_path: Path) -> None:
+    env = environment({"joint_names": ["elbow_joint"]})
+    env["actions"]["other"] = {
+        **env["actions"]["arm_action"],
+        "asset_name": "gripper",
+        "joint_names": ["elbow_joint", "x"],
+    }
+    env["scene"]["gripper"] = env["scene"]["robot"]
+    train(tmp_path / "run", settings(), env)
+    refuse(tmp_path / "run", "'other' acts on the joints elbow_joint, x in the robot's own order", joint_order=ROBOT)
+    env["actions"]["other"] |= {"preserve_order": True, "use_default_offset": False}
+    (tmp_path / "run" / "params" / "env.yaml").write_text(yaml.dump(env, sort_keys=False))
+    action = export(tmp_path / "run", [], ROBOT).contract.action_space
+    assert [element.name for element in action.elements] == ["elbow_joint", "elbow_joint", "x"]
+
+
+@pytest.mark.parametrize(
     "change",
     [
         lambda env: env["sim"].pop("physx"),  # neither release
@@ -726,24 +785,46 @@ def test_given_convention_does_not_overrule_the_files(tmp_path: Path) -> None:
             export_checkpoint(tmp_path / "run", tmp_path / "out", conventions=given, notify=lambda _: None)
 
 
-def test_relative_action_is_scaled_clipped_and_called_relative(tmp_path: Path, notices: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("seen", "factor", "offset"),
+    [
+        ({"func": f"{OBSERVATIONS}:joint_pos"}, 1.0, 0.0),
+        ({"clip": [-100.0, 100.0]}, 1.0, 0.25),  # joint_pos_rel, from a default of 0.25 rad
+        ({"scale": 0.5}, 2.0, 0.25),
+        ({"clip": [-1.0, 1.0]}, 0.0, 0.0),  # no longer a position, so the action stays relative
+        ({"func": f"{OBSERVATIONS}:joint_effort"}, 0.0, 0.0),
+    ],
+    ids=["absolute", "from the default", "scaled", "clipped", "not seen"],
+)
+@pytest.mark.parametrize("before", ["", "base_lin_vel"])
+def test_relative_action_is_scaled_clipped_and_added_to_the_position_that_is_observed(
+    before: str, seen: dict[str, Any], factor: float, offset: float, tmp_path: Path, notices: list[str]
+) -> None:
     term = {
         "class_type": "isaaclab.envs.mdp.actions.joint_actions:RelativeJointPositionAction", "joint_names": [".*"],
         "scale": 0.0625, "offset": 3.0, "use_zero_offset": True, "clip": {"elbow_joint": [-0.01, 0.01]},
     }  # fmt: skip
     env = reach_task("3", term)
     del env["actions"]["arm_action"]["use_default_offset"]
-    del env["observations"]["policy"]["actions"]
-    runner = trained_arm(tmp_path / "run", env, size=19)
+    terms = env["observations"]["policy"]
+    del terms["actions"]
+    terms["joint_pos"] |= seen
+    first, size = (3, 22) if before else (0, 19)
+    if before:
+        env["observations"]["policy"] = {before: {"func": f"{OBSERVATIONS}:{before}", "params": {}}, **terms}
+    runner = trained_arm(tmp_path / "run", env, size=size)
     result = export(tmp_path / "run", notices)
     elements = result.contract.action_space.elements
     assert [(one.quantity, one.joint, one.unit) for one in elements] == [
-        ("relative joint position", joint, "rad") for joint in UR
+        ("joint position" if factor else "relative joint position", joint, "rad") for joint in UR
     ]
     torch.manual_seed(5)
-    episodes = [2 + 3 * torch.randn(8, 19)]
+    episodes = [2 + 3 * torch.randn(8, size)]
     raw = np.array(raw_actions(runner, episodes)) * 0.0625
     wanted = raw.copy()
     wanted[:, 2] = np.clip(wanted[:, 2], -0.01, 0.01)
     assert (raw != wanted).any()
+    if factor:
+        wanted += episodes[0][:, first : first + 6].numpy() * factor + offset
     np.testing.assert_allclose(bundle_actions(result, episodes), wanted, rtol=1e-5, atol=2e-6)
+    assert not any("relative action's" in one for one in result.contract.parity.unreached)

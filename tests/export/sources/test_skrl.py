@@ -150,6 +150,31 @@ def test_the_scaler_and_the_environments_scale_are_baked_in(tmp_path: Path, noti
     assert "expressions that skrl evaluates" in notices[0]
 
 
+def test_a_relative_action_is_added_to_the_position_that_is_observed(tmp_path: Path) -> None:
+    agent = train(tmp_path / "run", config(), Box(-1, 1, (2,), np.float32))
+    of_joints = {"asset_cfg": {"name": "robot", "joint_names": ["pan", "lift"]}}
+    places = "isaaclab.envs.mdp.observations"
+    env = {"actions": {"arm": {
+        "class_type": "isaaclab.envs.mdp.actions.joint_actions:RelativeJointPositionAction", "scale": 0.0625,
+        "joint_names": ["pan", "lift"], "use_zero_offset": True, "clip": {"pan": [-0.01, 0.01]}}},
+        "observations": {"policy": {"concatenate_terms": True, "joint_vel": {"func": f"{places}:joint_vel",
+            "params": of_joints}, "joint_pos": {"func": f"{places}:joint_pos_rel", "params": of_joints}}},
+        "scene": {"robot": {"init_state": {"joint_pos": {"lift": 0.3, "pan": -1.0}}}}}  # fmt: skip
+    (tmp_path / "run" / "params" / "env.yaml").write_text(yaml.dump(env, sort_keys=False))
+    order = ["lift", "wrist", "pan"]
+    result = export_checkpoint(tmp_path / "run", tmp_path / "out", name="arm", joint_order=order, notify=lambda _: None)
+    obs = observations()
+    with torch.no_grad():
+        raw = agent.act(obs, None, timestep=0, timesteps=0)[1]["mean_actions"].numpy()
+    steps = np.clip(raw * 0.0625, [-np.inf, -0.01], [np.inf, 0.01])
+    with Policy.load(result.path) as policy:
+        found = [policy.act(one.numpy()) for one in obs]
+    np.testing.assert_allclose(found, steps + obs[:, 2:].numpy() + [0.3, -1.0], rtol=1e-5, atol=2e-6)
+    assert [(e.quantity, e.joint) for e in result.contract.action_space.elements] == [
+        ("joint position", "lift"), ("joint position", "pan"),
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("scaled", [False, True])
 def test_a_critic_may_see_more_than_the_policy(tmp_path: Path, scaled: bool) -> None:
     """Isaac Lab's `state_space`: the value function's own input, whose size only its weights have."""
@@ -360,6 +385,8 @@ def test_runs_that_cannot_be_read_are_refused_with_the_reason(tmp_path: Path) ->
     refuse(run, "cannot be restored from agent.yaml: .*policy|size mismatch|Error")
     file.write_text(yaml.dump(config("PPO_RNN")))
     refuse(run, "is of a recurrent agent.*examples/skrl_recurrent.py", UnsupportedError)
+    file.write_text(yaml.dump(config("MAPPO")))
+    refuse(run, r"is of several agents \(MAPPO: .*\): give the policy of each", UnsupportedError)
     file.write_text("models: [")
     refuse(run, "agent.yaml cannot be read")
     file.write_bytes(b"models:\xff")

@@ -49,6 +49,19 @@ def test_names_units_scale_and_clip_are_arguments(tmp_path: Path, notices: list[
     assert (np.abs(wanted) == ARM.high).any(), "nothing was clipped"
 
 
+def test_normalized_weights_are_exported(tmp_path: Path, notices: list[str]) -> None:
+    """A copy of torch's weight_norm loses the docstring of a hook, and was refused for it."""
+    normalized = torch.nn.utils.parametrizations.weight_norm(nn.Linear(3, 8))
+    module = nn.Sequential(normalized, nn.Tanh(), nn.Linear(8, 2))
+    result = rlservo.export_policy(module.eval(), SEEN, ARM, tmp_path, name="arm", notify=notices.append)
+    obs = torch.randn(5, 3)
+    with Policy.load(result.path) as policy, torch.no_grad():
+        np.testing.assert_allclose(
+            [policy.act(one.numpy()) for one in obs], module(obs).clamp(torch.tensor(ARM.low), torch.tensor(ARM.high)),
+            rtol=1e-5, atol=2e-6,
+        )  # fmt: skip
+
+
 class Parts(nn.Module):
     """A layer over two parts of an observation."""
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bundles import write_box_policy
 from command_line import rlservo_here
 from rlservo.errors import UsageError
 from rlservo.policy.policy import Policy
@@ -120,9 +120,9 @@ def test_episodes_without_rewards_cannot_be_used(ur5: Path, tmp_path: Path) -> N
         estimate(Recording(tmp_path / "run.mcap"), ur5)
 
 
-def test_recorder_and_candidate_may_be_two_versions(box_policy: Callable[..., Path], tmp_path: Path) -> None:
+def test_recorder_and_candidate_may_be_two_versions(tmp_path: Path) -> None:
     """Of a continuous policy: the same network as another version has the recorded return."""
-    one, two = (box_policy(tmp_path / "policies", version=version) for version in ("1", "2"))
+    one, two = (write_box_policy(tmp_path / "policies", version=version) for version in ("1", "2"))
     rng = np.random.default_rng(0)
     with WithRecording(Policy.load(one), tmp_path / "run.mcap", wait=True) as policy:
         for _ in range(600):
@@ -135,10 +135,8 @@ def test_recorder_and_candidate_may_be_two_versions(box_policy: Callable[..., Pa
     assert all(one.supported and one.value == pytest.approx(report.recorded_return) for one in report.estimates)
 
 
-def test_the_return_of_several_recorded_versions_is_not_shown_as_one(
-    box_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    bundles = [box_policy(tmp_path / "policies", version=version, seed=int(version)) for version in ("1", "2")]
+def test_the_return_of_several_recorded_versions_is_not_shown_as_one(tmp_path: Path) -> None:
+    bundles = [write_box_policy(tmp_path / "policies", version=version, seed=int(version)) for version in ("1", "2")]
     with Recorder(tmp_path / "run.mcap") as recorder:
         for bundle, reward in zip(bundles, (1.0, 5.0), strict=True):
             acting = WithRecording(Policy.load(bundle), recorder)
@@ -151,10 +149,8 @@ def test_the_return_of_several_recorded_versions_is_not_shown_as_one(
     assert "  ur5/1: 1 in 3 episodes" in done.stdout and "  ur5/2: 5 in 3 episodes" in done.stdout
 
 
-def test_a_deterministic_policy_of_continuous_actions_cannot_be_estimated(
-    box_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    bundle = box_policy(tmp_path / "policies")
+def test_a_deterministic_policy_of_continuous_actions_cannot_be_estimated(tmp_path: Path) -> None:
+    bundle = write_box_policy(tmp_path / "policies")
     with WithRecording(Policy.load(bundle), tmp_path / "run.mcap") as policy:
         policy.reset()
         policy.act(np.zeros(27, np.float32), explore=True)

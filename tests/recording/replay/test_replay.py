@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bundles import write_box_policy, write_leaky_policy
 from rlservo.bundle.spaces import Element
 from rlservo.deploy.cli import main
 from rlservo.policy.options import PolicyOptions
@@ -55,10 +55,8 @@ def test_discrete_policy_replays(policies: Path, tmp_path: Path, explore: bool) 
     assert (report.compared, report.identical, report.changed) == (100, 100, 0)
 
 
-def test_recurrent_state_and_step_limits_start_with_the_episode(
-    leaky_policy: Callable[..., Path], ur5: Path, tmp_path: Path
-) -> None:
-    bundle = leaky_policy(tmp_path / "policies")
+def test_recurrent_state_and_step_limits_start_with_the_episode(ur5: Path, tmp_path: Path) -> None:
+    bundle = write_leaky_policy(tmp_path / "policies")
     for file, options in (("free", {}), ("limited", {"max_action_step": 0.1})):
         recording = recorded(bundle, tmp_path / f"{file}.mcap", **options)
         report = replay(recording, bundle)
@@ -69,8 +67,8 @@ def test_recurrent_state_and_step_limits_start_with_the_episode(
     assert (report.compared, report.identical) == (100, 100)
 
 
-def test_recurrent_policy_is_not_followed_over_a_gap(leaky_policy: Callable[..., Path], tmp_path: Path) -> None:
-    bundle = leaky_policy(tmp_path / "policies")
+def test_recurrent_policy_is_not_followed_over_a_gap(tmp_path: Path) -> None:
+    bundle = write_leaky_policy(tmp_path / "policies")
     with Recorder(tmp_path / "run.mcap") as recorder:
         policy = WithRecording(Policy.load(bundle), recorder)
         kept, recorder.record = recorder.record, lambda record: record.step == 10 or kept(record)  # type: ignore
@@ -80,12 +78,12 @@ def test_recurrent_policy_is_not_followed_over_a_gap(leaky_policy: Callable[...,
 
 
 def test_long_episode_of_a_recurrent_policy_goes_on_from_piece_to_piece(
-    leaky_policy: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from rlservo.recording import episodes as module
 
     monkeypatch.setattr(module, "LONGEST_PIECE", 7)
-    bundle = leaky_policy(tmp_path / "policies")
+    bundle = write_leaky_policy(tmp_path / "policies")
     report = replay(recorded(bundle, tmp_path / "run.mcap"), bundle)
     assert (report.episodes, report.compared, report.identical) == (4, 100, 100)
 
@@ -123,11 +121,9 @@ def test_fallback_actions_are_not_compared_and_limits_count_from_them(ur5: Path,
     assert (report.compared, report.identical) == (10, 10)
 
 
-def test_another_contract_is_refused_with_the_elements(
-    policies: Path, tmp_path: Path, box_policy: Callable[..., Path], rewrite_contract: Callable[..., None]
-) -> None:
+def test_another_contract_is_refused_with_the_elements(policies: Path, tmp_path: Path) -> None:
     recording = recorded(policies / "ur5" / "1", tmp_path / "run.mcap")
-    other = box_policy(tmp_path / "other")
+    other = write_box_policy(tmp_path / "other")
     contract = Policy.load(other).contract
     space = contract.observation_space
     elements = (*space.elements[:3], Element(name="wrist_camera", unit="rad"), *space.elements[4:])

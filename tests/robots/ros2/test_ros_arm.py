@@ -36,12 +36,6 @@ def sim(ros: Ros) -> Process:
     return sim
 
 
-@pytest.fixture(scope="module")
-def nodes() -> list[Process]:
-    """Nodes that tests have started: all but the last have ended."""
-    return []
-
-
 @pytest.fixture
 def node(ros: Ros, sim: Process, all_shipped: Path, nodes: list[Process]) -> Process:
     """The node of a shipped policy; tests share it until one ends it."""

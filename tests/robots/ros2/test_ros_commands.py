@@ -1,7 +1,8 @@
-"""Velocity commands and trajectories: the arm keeps up, and stands when their process is killed."""
+"""Commands: the arm keeps up, stands when their process is killed, and what no subscriber gets is a fault."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ros import Ros
+from ros import ROOT, Ros
 
 BRAKING_S = 2.0  # the guard's 0.1 s of silence, braking, and a busy machine; without a guard it never stops
 PROGRAM = """
@@ -53,3 +54,31 @@ def test_killed_stream_leaves_a_standing_arm_with(how: str, ros: Ros) -> None:
     ros.wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in helpers))
     assert sim.end() == 0
     assert not [line for line in sim.lines if "protective" in line or "rejected" in line]
+
+
+TOPIC, KIND = "/restarted_controller/commands", "std_msgs/msg/Float64MultiArray"
+COMMANDER = f"""
+import time
+from rlservo.robots.ros2.link import take_command
+from rlservo.robots.ros2.rclpy_link import RclpyLink
+_, publish = take_command(RclpyLink("commander"), {TOPIC!r}, {KIND!r})
+print("commands", flush=True)
+while True:
+    publish({{"data": [0.0]}})
+    time.sleep(0.02)
+"""
+
+
+def test_subscriber_that_comes_back_and_cannot_get_the_commands_is_a_fault(ros: Ros) -> None:
+    controller = ros.python(str(ROOT / "tests" / "ros_graph.py"))
+    controller.wait_for("ready")
+    controller.type(json.dumps(["subscribe", {"topic": TOPIC, "kind": KIND}]))
+    commander = ros.python("-c", COMMANDER)
+    commander.wait_for("commands")
+    ros.ask("subscribe", topic=TOPIC, kind=KIND, is_kept=True)
+    time.sleep(1.0)
+    assert commander.process.poll() is None  # one subscriber still gets them
+    controller.end(signal.SIGKILL)
+    why = commander.wait_for("unheard: ")
+    assert f"{TOPIC}: the quality of service keeps our commands from /bystander (Volatile publisher" in why
+    assert commander.end(signal.SIGKILL)

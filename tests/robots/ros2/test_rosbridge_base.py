@@ -297,6 +297,7 @@ class DriftingRobot:
     """A link to a base whose clock differs from ours, and goes slower."""
 
     SLOWER = 50e-6  # a usual quartz's
+    knows_quality = False
 
     def __init__(self) -> None:
         self.now, self.delay_s = 1000.0, 0.05

@@ -22,16 +22,17 @@ from typing import Any, BinaryIO
 
 import pytest
 
+from bundles import controlled
 from rlservo.errors import UsageError
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.pages import FOLDER, SWAGGER_FILES
-from rlservo.serve_app.protocols.routes import WEBSOCKET
+from rlservo.serve_app.protocols.routing import WEBSOCKET
 from rlservo.serve_app.server.api_keys import Access, new_key
 from rlservo.serve_app.server.logs import FIELDS, configure
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
+from servers import over_uvicorn
 
-Serve = Callable[[Any], AbstractContextManager[int]]
 Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
 ROBOT, ROBOT_LINE = new_key("cell-7")
@@ -195,7 +196,7 @@ class Served:
 
 
 @pytest.fixture(params=["keys", "operator", "none"])
-def server(request: pytest.FixtureRequest, policies: Path, controlled: Controlled, served: Serve) -> Iterator[Served]:
+def server(request: pytest.FixtureRequest, policies: Path) -> Iterator[Served]:
     """With keys of both kinds; with an operator's key alone; with none."""
     settings = {
         "keys": ServerSettings(api_keys=f"{ROBOT_LINE},{ADMIN_LINE}"),
@@ -204,12 +205,12 @@ def server(request: pytest.FixtureRequest, policies: Path, controlled: Controlle
     }[request.param]
     with controlled(policies) as control:
         app = create_app(control, settings)
-        with served(app) as port:
+        with over_uvicorn(app) as port:
             yield Served(app, control, port, request.param)
 
 
 @pytest.fixture(scope="module")
-def app(policies: Path, controlled: Controlled) -> Iterator[PolicyApp]:
+def app(policies: Path) -> Iterator[PolicyApp]:
     with controlled(policies) as control:
         yield create_app(control, ServerSettings())
 
@@ -366,12 +367,10 @@ UPGRADE = (
 
 
 @pytest.mark.parametrize("path", ["/", "/v1/policies/ur5/stream", "/v1/policies/ur5/versions/1/stream"])
-def test_no_spelling_of_a_streams_path_opens_it_without_a_key(
-    policies: Path, controlled: Controlled, served: Serve, path: str
-) -> None:
+def test_no_spelling_of_a_streams_path_opens_it_without_a_key(policies: Path, path: str) -> None:
     with controlled(policies) as control:
         settings = ServerSettings(api_keys=ROBOT_LINE, default_policy="ur5")
-        with served(create_app(control, settings)) as port, Wire(port) as wire:
+        with over_uvicorn(create_app(control, settings)) as port, Wire(port) as wire:
             for target in spellings(path):
                 for key in ((), bearer(WRONG)):
                     status, _ = wire.ask(b"GET", target, *UPGRADE, *key, body=b"")
@@ -386,13 +385,13 @@ def entries(caplog: pytest.LogCaptureFixture, logger: str) -> list[dict[str, Any
 
 
 def test_who_administers_and_whose_key_is_refused_is_in_the_log(
-    policies: Path, controlled: Controlled, served: Serve, caplog: pytest.LogCaptureFixture
+    policies: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", logger="rlservo")
     path = b"/v1/admin/policies/ur5/alias"
     with controlled(policies) as control:
         settings = ServerSettings(api_keys=f"{ROBOT_LINE},{ADMIN_LINE}")
-        with served(create_app(control, settings)) as port, Wire(port) as wire:
+        with over_uvicorn(create_app(control, settings)) as port, Wire(port) as wire:
             body = b'{"alias": "candidate", "version": "2"}'
             assert wire.ask(b"POST", path, *bearer(ADMIN), b"x-request-id: change-1", body=body)[0] == 200
             wrong = b'{"alias": "candidate", "version": "77"}'
@@ -424,9 +423,7 @@ def test_who_administers_and_whose_key_is_refused_is_in_the_log(
     assert WRONG not in caplog.text and ADMIN not in caplog.text
 
 
-def test_every_command_is_in_the_audit_whatever_became_of_it_and_no_key_is(
-    policies: Path, controlled: Controlled, served: Serve, tmp_path: Path
-) -> None:
+def test_every_command_is_in_the_audit_whatever_became_of_it_and_no_key_is(policies: Path, tmp_path: Path) -> None:
     file = tmp_path / "audit.jsonl"
     settings = ServerSettings(
         api_keys=f"{ROBOT_LINE},{ADMIN_LINE}", audit_file=str(file), log_level="error",
@@ -448,7 +445,7 @@ def test_every_command_is_in_the_audit_whatever_became_of_it_and_no_key_is(
     with contextlib.ExitStack() as stack:
         stack.enter_context(listening_log(settings))
         control = stack.enter_context(controlled(policies))
-        port = stack.enter_context(served(create_app(control, settings)))
+        port = stack.enter_context(over_uvicorn(create_app(control, settings)))
         with Wire(port) as wire:
             for command, body, _ in attempts:
                 wire.ask(b"POST", b"/v1/admin/policies/ur5/" + command, *bearer(ADMIN), body=body)

@@ -10,8 +10,7 @@ import shutil
 import stat
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from bundles import write_box_policy
 from rlservo.client.admin_client import AdminClient, find_key
 from rlservo.client.formats.admin_key_file import key_file, read_key, written_key
 from rlservo.deploy.cli import app as command_line
@@ -38,20 +38,20 @@ from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.deployment_plan import ServedConfig
+from rlservo.serve_app.versions.plan_commands import parse
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from servers import exchange
+from servers import exchange, over_uvicorn
 from stores import plan_files
 
 OBS = [round(0.01 * i, 2) for i in range(27)]
-Serve = Callable[[Any], AbstractContextManager[int]]
 
 
 @pytest.fixture(scope="module")
-def folder(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """ur5 in 1, 2, 10 and a broken 11, a contract that is none under 13; gridworld in 1, twice."""
     root = Path(shutil.copytree(policies, tmp_path_factory.mktemp("admin") / "policies"))
-    box_policy(root, version="11", seed=4)
+    write_box_policy(root, version="11", seed=4)
     (root / "ur5" / "11" / "golden.npz").unlink()
     shutil.copytree(root / "gridworld" / "1", root / "gridworld" / "2")
     (root / "ur5" / "13").mkdir()
@@ -67,14 +67,14 @@ def key_path(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 @pytest.fixture
-def port(folder: Path, key_path: Path, served: Serve, tmp_path: Path) -> Iterator[int]:
+def port(folder: Path, key_path: Path, tmp_path: Path) -> Iterator[int]:
     """A server on which only the operator needs a key; ur5 in 1 and 2, production 1."""
     digest = "sha256:" + hashlib.sha256(read_key(key_path).encode()).hexdigest()
     control = PlanFollower(VersionLoader(Repository([folder])), plan_files(tmp_path))
     config = {"policies": {"ur5": {"versions": ["1", "2"], "aliases": {"production": "1"}},
                            "gridworld": {"versions": ["1"]}}, "unlisted": "ignore"}  # fmt: skip
     asyncio.run(control.configure(config))
-    with served(create_app(control, ServerSettings(operator_key=digest), replica="only")) as port:
+    with over_uvicorn(create_app(control, ServerSettings(operator_key=digest), replica="only")) as port:
         yield port
 
 
@@ -154,7 +154,7 @@ def test_triton_load_and_unload_are_the_same_commands(port: int, key_path: Path)
 
 
 @pytest.fixture
-def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> Iterator[tuple[AdminClient, int, Path]]:
+def started(policies: Path, key_path: Path, tmp_path: Path) -> Iterator[tuple[AdminClient, int, Path]]:
     """A server started as `rlservo serve DIR` does, with nothing said, over ur5 in 1 and 2."""
     root = tmp_path / "policies"
     for version in ("1", "2"):
@@ -163,7 +163,7 @@ def started(policies: Path, key_path: Path, served: Serve, tmp_path: Path) -> It
     control = PlanFollower(VersionLoader(Repository([root])), plan_files(root))
     asyncio.run(control.configure({}))
     app = create_app(control, ServerSettings(operator_key=digest), replica="only")
-    with served(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
+    with over_uvicorn(app) as port, AdminClient(f"http://127.0.0.1:{port}", api_key=read_key(key_path)) as client:
         yield client, port, root
 
 
@@ -194,7 +194,7 @@ def test_from_the_default_start_on_a_load_changes_no_reply_and_a_rollback_leads_
 
 
 def test_a_policy_unloaded_and_loaded_again_is_served_and_knows_its_way_back(
-    started: tuple[AdminClient, int, Path], box_policy: Callable[..., Path]
+    started: tuple[AdminClient, int, Path],
 ) -> None:
     admin, port, root = started
     admin.alias("ur5", "production", "1")
@@ -203,7 +203,7 @@ def test_a_policy_unloaded_and_loaded_again_is_served_and_knows_its_way_back(
     admin.load("ur5")
     assert act(port)["version"] == "2"
     shutil.rmtree(root / "ur5" / "1")
-    shutil.move(box_policy(root.parent / "other", version="1", seed=8), root / "ur5" / "1")
+    shutil.move(write_box_policy(root.parent / "other", version="1", seed=8), root / "ur5" / "1")
     with pytest.raises(RefusedError, match="is not the bundle that was accepted"):  # and not another one of that name
         admin.rollback("ur5", "production")
     assert act(port)["version"] == "2"
@@ -219,10 +219,10 @@ def test_administration_needs_the_key_and_acting_does_not(port: int) -> None:
         client.recordings()
 
 
-def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, served: Serve, tmp_path: Path) -> None:
+def test_a_server_without_an_operator_lets_nobody_administer(folder: Path, tmp_path: Path) -> None:
     control = PlanFollower(VersionLoader(Repository([folder / "ur5" / "1"])), plan_files(tmp_path))
     asyncio.run(control.configure({}))
-    with served(create_app(control, ServerSettings())) as open_port:
+    with over_uvicorn(create_app(control, ServerSettings())) as open_port:
         with (
             AdminClient(f"http://127.0.0.1:{open_port}", api_key="any") as client,
             pytest.raises(ForbiddenError, match="this server has none"),
@@ -244,6 +244,8 @@ def test_commands_say_what_is_wrong_with_them(admin: AdminClient) -> None:
         admin.load("ur5", "../1")
     with pytest.raises(RequestError, match="share"):
         admin.canary("ur5", "2", 1.5)
+    with pytest.raises(RequestError, match="share"):
+        parse("canary", {"version": "2", "share": 10**400})  # which no float can hold
     with pytest.raises(RequestError, match="needs a share"):
         admin.canary("ur5", "2")
 
@@ -342,6 +344,12 @@ def test_the_command_line_names_the_file_of_a_wrong_key(port: int, tmp_path: Pat
         with pytest.raises((UnauthenticatedError, UsageError)) as caught:
             run(port, file, "unload", "ur5")
         assert sentence in caught.value.message
+    file.write_text(new_key("stranger", admin=True)[0])
+    promote = ["promote", "ur5", "2", "--max-error-rate", "1%", "--log", str(tmp_path / "log.jsonl")]
+    result = CliRunner().invoke(
+        command_line, ["policy", *promote, "--url", f"http://127.0.0.1:{port}", "--key-file", str(file)]
+    )
+    assert f"does not know the key in {file}: expected" in f"{result.output}{result.exception}"
 
 
 def test_the_operators_key_is_for_this_user_alone_and_goes_with_the_server(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urljoin
@@ -16,6 +14,7 @@ from browser import Browser
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.protocols.pages import FOLDER
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import over_uvicorn
 from stores import control_of, load_store
 
 
@@ -40,12 +39,10 @@ class BehindPrefix:
         await self._app(scope, receive, send)
 
 
-def test_the_document_says_that_its_paths_are_beside_it(
-    policies: Path, served: Callable[[Any], AbstractContextManager[int]]
-) -> None:
+def test_the_document_says_that_its_paths_are_beside_it(policies: Path) -> None:
     store = load_store(policies)
     app = create_app(control_of(store), ServerSettings())
-    with served(BehindPrefix(app, "/robots")) as port:
+    with over_uvicorn(BehindPrefix(app, "/robots")) as port:
         address = f"http://127.0.0.1:{port}/robots/openapi.json"
         (server,) = httpx.get(address, trust_env=False).json()["servers"]
         url = urljoin(address, server["url"]).rstrip("/") + "/healthz"
@@ -54,11 +51,11 @@ def test_the_document_says_that_its_paths_are_beside_it(
 
 @pytest.mark.parametrize("prefix", ["", "/robots"])
 def test_the_documentation_is_drawn_and_tried_out_without_the_internet(
-    browser: Browser, policies: Path, served: Callable[[Any], AbstractContextManager[int]], prefix: str
+    browser: Browser, policies: Path, prefix: str
 ) -> None:
     store = load_store(policies)
     app = BehindPrefix(create_app(control_of(store), ServerSettings()), prefix)
-    with served(app) as port, browser.tab() as tab:
+    with over_uvicorn(app) as port, browser.tab() as tab:
         tab.visit(f"http://127.0.0.1:{port}{prefix}/docs")
         drawn = tab.wait_for(  # what Swagger UI makes of /openapi.json
             "(drawn => drawn.length > 3 && drawn.map(path => path.dataset.path))"

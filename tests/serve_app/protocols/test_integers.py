@@ -5,25 +5,21 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
-import msgpack
 import numpy as np
 import pytest
-import websockets.sync.client
 from onnx import TensorProto, helper
 
-from bundles import PARITY, PROVENANCE, save_graph, write_bundle
+from bundles import contract_of, rewrite_contract, save_graph, write_bundle, write_discrete_policy, write_leaky_policy
 from rlservo.bundle import bundle as bundle_files
-from rlservo.bundle.contract import BakedStep, Contract, TensorSpec
 from rlservo.bundle.spaces import BoxSpec
 from rlservo.errors import ObservationError, RequestError
 from rlservo.policy.input_numbers import parse_array
-from rlservo.policy.observation_check import ObservationParser
+from rlservo.policy.observation_parser import ObservationParser
 from rlservo.policy.options import PolicyOptions
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
@@ -31,7 +27,9 @@ from rlservo.serve_app.protocols.open_inference.grpc_service import FIELDS, OipG
 from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.sessions.request import Request
+from servers import over_uvicorn
 from stores import control_of, load_store
+from streams import Stream
 
 TYPES = {"int64": TensorProto.INT64, "uint64": TensorProto.UINT64, "uint8": TensorProto.UINT8}
 # As JSON has them, for a policy that observes two int64, two uint64 or two uint8.
@@ -87,19 +85,8 @@ def write_counter(root: Path, dtype: str) -> Path:
         [("obs", TYPES[dtype], ["batch", 2])],
         [("action", TensorProto.FLOAT, ["batch", 2])],
     )
-    contract = Contract(
-        name=dtype,
-        version="1",
-        observation_space=BoxSpec(shape=(2,), dtype=dtype, low=None, high=None),
-        action_space=BoxSpec(shape=(2,), dtype="float32", low=None, high=None),
-        inputs=(TensorSpec(name="obs", dtype=dtype, shape=(-1, 2)),),
-        outputs=(TensorSpec(name="action", dtype="float32", shape=(-1, 2)),),
-        distribution=None,
-        baked_in=(BakedStep(step="network"),),
-        control_rate_hz=None,
-        provenance=PROVENANCE,
-        parity=PARITY,
-    )
+    spaces = (BoxSpec(shape=(2,), dtype=each, low=None, high=None) for each in (dtype, "float32"))
+    contract = contract_of(dtype, *spaces)
     return write_bundle(folder, contract, np.arange(8, dtype=dtype).reshape(4, 2))
 
 
@@ -113,8 +100,8 @@ def app(tmp_path_factory: pytest.TempPathFactory) -> PolicyApp:
 
 
 @pytest.fixture(scope="module")
-def http(app: PolicyApp, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[httpx.Client]:
-    with served(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
+def http(app: PolicyApp) -> Iterator[httpx.Client]:
+    with over_uvicorn(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
         yield client
 
 
@@ -200,12 +187,8 @@ def test_so_are_bytes(http: httpx.Client, app: PolicyApp, policy: str, array: An
     if datatype in FIELDS:
         with pytest.raises(ObservationError, match="integer"):
             over_grpc(app, policy, datatype, array, raw=False)
-    packed = {b"__ndarray__": True, b"data": array.tobytes(), b"dtype": array.dtype.str, b"shape": array.shape}
-    url = f"ws://127.0.0.1:{http.base_url.port}/v1/policies/{policy}/stream"
-    with websockets.sync.client.connect(url) as stream:
-        stream.recv()
-        stream.send(msgpack.packb({"obs": packed}))
-        assert "integer" in json.loads(stream.recv())["error"]
+    with Stream(http.base_url.port or 0, f"/v1/policies/{policy}/stream") as stream:
+        assert "integer" in stream.ask(obs=array)["error"]
 
 
 def over_grpc(app: PolicyApp, policy: str, datatype: str, array: Any, *, raw: bool) -> Any:
@@ -246,8 +229,8 @@ def test_in_process_too(app: PolicyApp, given: Any) -> None:
 
 
 @pytest.mark.parametrize("value", [1.7, 2.0**63, 10**6 + 9, "1", [None], True])
-def test_a_last_action_is_read_as_an_observation_is(tmp_path: Path, discrete_policy: Any, value: Any) -> None:
-    policy = Policy.load(discrete_policy(tmp_path, start=10**6))
+def test_a_last_action_is_read_as_an_observation_is(tmp_path: Path, value: Any) -> None:
+    policy = Policy.load(write_discrete_policy(tmp_path, start=10**6))
     if value is True:
         value = np.array(2**40 + 10**6, np.int64)
     with pytest.raises(RequestError, match="last_action"):
@@ -255,8 +238,8 @@ def test_a_last_action_is_read_as_an_observation_is(tmp_path: Path, discrete_pol
 
 
 @pytest.mark.parametrize("text", ["1", "\N{ARABIC-INDIC DIGIT THREE}", b"1"])
-def test_digits_in_a_text_are_no_number_wherever_they_are_sent(leaky_policy: Any, tmp_path: Path, text: Any) -> None:
-    policy = Policy.load(leaky_policy(tmp_path))
+def test_digits_in_a_text_are_no_number_wherever_they_are_sent(tmp_path: Path, text: Any) -> None:
+    policy = Policy.load(write_leaky_policy(tmp_path))
     for given in (
         {"obs": [text, 0, 0]},
         {"obs": [0, 0, 0], "state": {"h": [text, 0]}},
@@ -290,7 +273,7 @@ def test_a_float_is_the_nearest_one_that_its_space_has(dtype: str, sent: float, 
         parser.parse([{"float16": 65520.0, "float32": 3.5e38, "float64": float("inf")}[dtype], 1])
 
 
-def test_clipping_one_element_leaves_the_others_as_they_are(tmp_path: Path, rewrite_contract: Any) -> None:
+def test_clipping_one_element_leaves_the_others_as_they_are(tmp_path: Path) -> None:
     folder = write_counter(tmp_path, "int64")
     low, high = (None, 0), (None, 10)
     rewrite_contract(folder, observation_space=BoxSpec(shape=(2,), dtype="int64", low=low, high=high))

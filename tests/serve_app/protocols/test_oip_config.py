@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bundles import write_box_policy, write_leaky_policy
+from grpc_calls import answered
 from rlservo.policy.options import PolicyOptions
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
 from rlservo.serve_app.protocols.open_inference.model_info import METHODS, statistics
 from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.deployment_plan import PolicyPlan
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
-from servers import exchange
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import exchange, over_uvicorn
 from stores import control_of, load_store
 
 OPTIONS = {
@@ -31,15 +30,10 @@ Ask = Callable[..., tuple[int, Any]]
 
 
 @pytest.fixture(scope="module")
-def store(
-    policies: Path,
-    box_policy: Callable[..., Path],
-    leaky_policy: Callable[..., Path],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> PolicyStore:
+def store(policies: Path, tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
     root = tmp_path_factory.mktemp("more")
-    box_policy(root, name="careful")
-    leaky_policy(root)
+    write_box_policy(root, name="careful")
+    write_leaky_policy(root)
     return load_store(policies, root, options=OPTIONS)
 
 
@@ -49,8 +43,8 @@ def app(store: PolicyStore) -> Any:
 
 
 @pytest.fixture(scope="module")
-def ask(app: Any, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[Ask]:
-    with served(app) as port:
+def ask(app: Any) -> Iterator[Ask]:
+    with over_uvicorn(app) as port:
 
         def call(path: str, body: Any = None) -> tuple[int, Any]:
             reply = exchange(port, "GET" if body is None else "POST", path, body)
@@ -159,26 +153,11 @@ def test_extensions_name_both(ask: Ask) -> None:
     assert {"model_configuration", "statistics"} <= set(ask("/v2")[1]["extensions"])
 
 
-class Context:
-    """A gRPC call without metadata; `failure` is its status if it failed."""
-
-    failure: Any = None
-
-    def invocation_metadata(self) -> list[Any]:
-        return []
-
-    def set_code(self, code: Any) -> None:
-        self.failure = code
-
-    set_details = set_trailing_metadata = lambda self, _value: None
-
-
 def over_grpc(store: PolicyStore, method: str, **fields: str) -> Any:
     """Return the reply to a call without an action, None if it failed."""
-    handler, context = create_app(control_of(store), ServerSettings()).handler, Context()
-    asked = getattr(messages, f"{method}Request")(**fields).SerializeToString()
-    reply = asyncio.run(Grpc(handler).answer(method, asked, context))
-    return reply if context.failure is None else None
+    handler = create_app(control_of(store), ServerSettings()).handler
+    reply, call = answered(handler, getattr(messages, f"{method}Request")(**fields), method=method)
+    return reply if call.code is None else None
 
 
 def test_grpcs_messages_take_every_field_of_the_documents(store: PolicyStore) -> None:

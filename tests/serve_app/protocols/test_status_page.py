@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from browser import Browser, Tab
+from bundles import controlled, write_box_policy, write_discrete_policy
 from rlservo.bundle.bundle import read_contract, write_contract
 from rlservo.bundle.contract import BakedStep
 from rlservo.bundle.spaces import BoxSpec, Element
@@ -31,7 +32,6 @@ from rlservo.serve_app.versions.plan_follower import PlanFollower
 from servers import over_uvicorn
 from stores import control_of, load_store
 
-Serve = Callable[[Any], AbstractContextManager[int]]
 Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
 CHROMIUM = "text/html,application/xhtml+xml,application/xml;q=0.9,image/avif,image/webp,*/*;q=0.8"
@@ -47,10 +47,10 @@ ROUND_MS = 250  # between two of the page's looks, instead of two seconds
 PICTURES = os.environ.get("RLSERVO_TEST_PICTURES")
 
 
-def test_programs_get_at_the_root_what_they_always_got(policies: Path, served: Serve) -> None:
+def test_programs_get_at_the_root_what_they_always_got(policies: Path) -> None:
     store = load_store(policies)
     for settings, statuses in ((ServerSettings(), (404, 404)), (ServerSettings(api_keys=ROBOT_LINE), (401, 404))):
-        with served(create_app(control_of(store), settings)) as port, httpx.Client() as client:
+        with over_uvicorn(create_app(control_of(store), settings)) as port, httpx.Client() as client:
             for accept in ("", "*/*", "application/json", "application/json, text/html;q=0.9"):
                 headers = {"accept": accept}
                 for key, status in zip(({}, {"authorization": f"Bearer {ROBOT}"}), statuses, strict=True):
@@ -62,9 +62,12 @@ def test_programs_get_at_the_root_what_they_always_got(policies: Path, served: S
                 assert client.request(method, f"http://127.0.0.1:{port}/", headers=PAGE).status_code == statuses[0]
 
 
-def test_the_page_is_open_its_data_are_not_and_nothing_may_be_added_to_it(policies: Path, served: Serve) -> None:
+def test_the_page_is_open_its_data_are_not_and_nothing_may_be_added_to_it(policies: Path) -> None:
     store = load_store(policies)
-    with served(create_app(control_of(store), ServerSettings(api_keys=ROBOT_LINE))) as port, httpx.Client() as client:
+    with (
+        over_uvicorn(create_app(control_of(store), ServerSettings(api_keys=ROBOT_LINE))) as port,
+        httpx.Client() as client,
+    ):
         url = f"http://127.0.0.1:{port}"
         page = client.get(f"{url}/", headers=PAGE)
         assert page.status_code == 200 and page.content == (FOLDER / "index.html").read_bytes()
@@ -131,7 +134,7 @@ NAMES += [f"{part} {axis}" for part in ("target", "hand", "obstacle") for axis i
 
 
 def describe(folder: Path, **changes: Any) -> None:
-    """Give a bundle of `box_policy` a filter, and what else its contract shall say."""
+    """Give a bundle of `write_box_policy` a filter, and what else its contract shall say."""
     contract = read_contract(folder)
     values = {"count": 1000.0, "mean": [0.0] * 27, "std": [0.5] * 27}
     step = BakedStep(step="mean_std_filter", detail=changes.pop("detail", "RLlib's filter"), values=values)
@@ -144,25 +147,23 @@ def observations(*names: str, unit: str = "rad") -> BoxSpec:
 
 
 @pytest.fixture(scope="module")
-def repository(
-    box_policy: Callable[..., Path], discrete_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def repository(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """ur5 in versions 1 and 2, both with a filter; gridworld."""
     root = tmp_path_factory.mktemp("policies")
     space = observations(*NAMES)
     for seed, version in enumerate("12"):
-        folder = box_policy(root, version=version, seed=seed)
+        folder = write_box_policy(root, version=version, seed=seed)
         describe(folder, description="Brings the arm's hand to a target.", observation_space=space)
-    discrete_policy(root)
+    write_discrete_policy(root)
     return root
 
 
 @pytest.fixture
-def server(repository: Path, controlled: Controlled, served: Serve) -> Iterator[Served]:
+def server(repository: Path) -> Iterator[Served]:
     """A server that asks for a key only who administers it; version 1 is in use."""
     with controlled(repository, config=FIRST) as control:
         settings = ServerSettings(operator_key=OPERATOR_LINE.split()[-1])
-        with served(create_app(control, settings, replica="replica-a")) as port:
+        with over_uvicorn(create_app(control, settings, replica="replica-a")) as port:
             yield Served(port)
 
 
@@ -317,14 +318,12 @@ def test_the_page_draws_requests_and_latency_over_time(tab: Tab, server: Served)
     assert tab.complaints == []
 
 
-def test_what_a_policy_says_of_itself_is_text(
-    tab: Tab, box_policy: Callable[..., Path], served: Serve, tmp_path: Path
-) -> None:
-    folder = box_policy(tmp_path)
+def test_what_a_policy_says_of_itself_is_text(tab: Tab, tmp_path: Path) -> None:
+    folder = write_box_policy(tmp_path)
     space = observations(MARKUP, *NAMES[1:], unit="<b>rad</b>")
     describe(folder, description=f"Reaches a target. {MARKUP}", observation_space=space, detail=MARKUP)
     store = load_store(tmp_path)
-    with served(create_app(control_of(store), ServerSettings())) as port:
+    with over_uvicorn(create_app(control_of(store), ServerSettings())) as port:
         Served(port).act(16)
         tab.visit(f"http://127.0.0.1:{port}")
         tab.wait_for_text(f"Reaches a target. {MARKUP}", "most 0 σ: <img")
@@ -341,9 +340,7 @@ def test_what_a_policy_says_of_itself_is_text(
 
 
 @pytest.mark.slow
-def test_several_replicas_are_summed_and_their_differences_said(
-    tab: Tab, repository: Path, controlled: Controlled, served: Serve
-) -> None:
+def test_several_replicas_are_summed_and_their_differences_said(tab: Tab, repository: Path) -> None:
     """Behind a proxy that takes turns, each answer is another replica's."""
     with controlled(repository, config=FIRST) as one, controlled(repository, config=FIRST) as other:
         replicas = [
@@ -355,7 +352,7 @@ def test_several_replicas_are_summed_and_their_differences_said(
         async def proxy(scope: Any, receive: Any, send: Any) -> None:
             await (replicas[0] if scope["type"] == "lifespan" else next(turns))(scope, receive, send)
 
-        with served(proxy) as port:
+        with over_uvicorn(proxy) as port:
             Served(port).act(50)
             tab.visit(f"http://127.0.0.1:{port}")
             tab.wait_for_text("replica-a", "replica-b", "the sum of what these said")
@@ -403,12 +400,10 @@ def test_the_page_reads_prometheus_text_as_it_is_written(tab: Tab, server: Serve
     assert found[2] is None
 
 
-def test_with_keys_the_page_asks_for_one_and_keeps_it_nowhere(
-    tab: Tab, repository: Path, controlled: Controlled, served: Serve, tmp_path: Path
-) -> None:
+def test_with_keys_the_page_asks_for_one_and_keeps_it_nowhere(tab: Tab, repository: Path, tmp_path: Path) -> None:
     with controlled(repository) as control:
         app = create_app(control, ServerSettings(api_keys=ROBOT_LINE))
-        with served(app) as port:
+        with over_uvicorn(app) as port:
             server = Served(port)
             server.act(3, key=ROBOT)
             tab.visit(server.url)
@@ -537,7 +532,7 @@ window.finished = Promise.all([
 </script>"""
 
 
-def test_a_foreign_page_gets_nothing_of_it(tab: Tab, server: Served, served: Serve) -> None:
+def test_a_foreign_page_gets_nothing_of_it(tab: Tab, server: Served) -> None:
     """Neither to read, nor to embed, nor to frame: 127.0.0.1 on another port is the same site to a browser."""
     content = (FOREIGN % json.dumps(server.url)).encode()
 
@@ -547,7 +542,7 @@ def test_a_foreign_page_gets_nothing_of_it(tab: Tab, server: Served, served: Ser
             await send({"type": "http.response.start", "status": 200, "headers": headers})
             await send({"type": "http.response.body", "body": content})
 
-    with served(foreign) as port:
+    with over_uvicorn(foreign) as port:
         tab.visit(f"http://127.0.0.1:{port}/")
         tab.wait_for("window.finished")
         found = tab.evaluate("window.finished")

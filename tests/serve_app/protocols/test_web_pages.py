@@ -18,12 +18,13 @@ import httpx
 import pytest
 
 from browser import REBOUND, Browser
+from bundles import controlled, write_leaky_policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_follower import PlanFollower
+from servers import over_uvicorn
 
-Serve = Callable[[Any], AbstractContextManager[int]]
 Controlled = Callable[..., AbstractContextManager[PlanFollower]]
 
 SESSION = "robot-7"
@@ -146,15 +147,13 @@ class Target:
 
 
 @pytest.fixture
-def target(
-    leaky_policy: Callable[..., Path], tmp_path: Path, controlled: Controlled, served: Serve
-) -> Iterator[Target]:
+def target(tmp_path: Path) -> Iterator[Target]:
     """A server without keys but the operator's, one policy with a memory, and a session on it."""
-    leaky_policy(tmp_path / "policies")
+    write_leaky_policy(tmp_path / "policies")
     _, line = new_key("operator", admin=True)
     with controlled(tmp_path / "policies") as control:
         pages = Pages(create_app(control, ServerSettings(operator_key=line.split()[-1])))
-        with served(pages) as port:
+        with over_uvicorn(pages) as port:
             yield Target(port, pages, control)
 
 
@@ -181,12 +180,12 @@ def test_the_servers_own_page_gets_through(browser: Browser, target: Target) -> 
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
-def test_a_page_from_another_port_moves_nothing(browser: Browser, target: Target, served: Serve, host: str) -> None:
+def test_a_page_from_another_port_moves_nothing(browser: Browser, target: Target, host: str) -> None:
     """127.0.0.1 on another port is the same site to a browser, localhost another one."""
     target.step(reset=True)
     plan = target.control.plan
     pages = Pages(nothing, page_for(f"http://127.0.0.1:{target.port}"))
-    with served(pages) as port:
+    with over_uvicorn(pages) as port:
         report = visit(browser, f"http://{host}:{port}/page.html", pages)
     assert report["act blob"] == report["infer blob"] == "sent", report
     check_untouched(target, report, plan)

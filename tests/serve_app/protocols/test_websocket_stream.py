@@ -3,101 +3,39 @@
 from __future__ import annotations
 
 import asyncio
-import functools
-import http.client
 import json
-import random
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
-import websockets.sync.client
 from numpy.typing import NDArray
 from uvicorn.protocols.utils import ClientDisconnected
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 
 from rlservo.bundle.contract import Contract
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.server.exposition import exposition
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import over_uvicorn
 from stores import control_of, load_store
+from streams import ARRAY, Stream, pack, unpack
 
 OBS = (np.arange(27) * 0.01).astype(np.float32)
-ARRAY = b"__ndarray__"
-
-
-def pack_array(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return {ARRAY: True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
-    if isinstance(value, np.generic):
-        return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
-    return value
-
-
-def unpack_array(value: Any) -> Any:
-    if ARRAY in value:
-        return np.ndarray(buffer=value[b"data"], dtype=np.dtype(value[b"dtype"]), shape=value[b"shape"])
-    return value
-
-
-pack = functools.partial(msgpack.packb, default=pack_array)
-unpack = functools.partial(msgpack.unpackb, object_hook=unpack_array)
-
-
-class OpenpiClient:
-    """The behaviour of openpi's WebsocketClientPolicy: metadata first, then request and response; text raises."""
-
-    def __init__(self, port: int, path: str = "", **headers: str) -> None:
-        self._connection = websockets.sync.client.connect(
-            f"ws://127.0.0.1:{port}{path}", compression=None, max_size=None, additional_headers=headers
-        )
-        self.socket = self._connection.__enter__()
-        self.metadata = unpack(self.socket.recv())
-
-    def infer(self, obs: dict[str, Any]) -> dict[str, Any]:
-        return self.exchange(pack(obs))
-
-    def exchange(self, content: bytes | str) -> dict[str, Any]:
-        self.socket.send(content)
-        response = self.socket.recv()
-        if isinstance(response, str):
-            raise RuntimeError(response)
-        reply: dict[str, Any] = unpack(response)
-        return reply
-
-    def close_code(self) -> int | None:
-        with pytest.raises(ConnectionClosed):
-            self.socket.recv()
-        return self.socket.close_code
-
-    def __enter__(self) -> OpenpiClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self._connection.__exit__(None, None, None)
 
 
 @pytest.fixture(scope="module")
-def store(policies: Path, box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
-    unsafe = box_policy(tmp_path_factory.mktemp("unsafe"), name="unsafe", action_scale=5.0)
-    return load_store(policies, unsafe)
-
-
-Serve = Callable[[Any], AbstractContextManager[int]]
+def store(policies: Path) -> PolicyStore:
+    return load_store(policies)
 
 
 @pytest.fixture(scope="module")
-def port(store: PolicyStore, served: Serve) -> Iterator[int]:
+def port(store: PolicyStore) -> Iterator[int]:
     settings = ServerSettings(max_body_bytes=100_000, max_batch=64, default_policy="ur5")
-    with served(create_app(control_of(store), settings)) as port:
+    with over_uvicorn(create_app(control_of(store), settings)) as port:
         yield port
 
 
@@ -106,42 +44,35 @@ def expected(store: PolicyStore, obs: Any = OBS, name: str = "ur5", version: str
 
 
 def test_an_openpi_client_at_the_root_gets_metadata_and_actions(port: int, store: PolicyStore) -> None:
-    with OpenpiClient(port) as client:
+    with Stream(port) as client:
         assert (client.metadata["policy"], client.metadata["version"]) == ("ur5", "10")
         assert Contract.model_validate(client.metadata["contract"]) == store.get("ur5").contract
-        first = client.infer({"obs": OBS})
+        first = client.ask(obs=OBS)
         assert first["actions"].shape == (1, 6) and first["actions"].dtype == np.float32
         np.testing.assert_array_equal(first["actions"][0], expected(store))
         assert set(first["server_timing"]) == {"infer_ms"} and first["server_timing"]["infer_ms"] > 0
-        second = client.infer({"obs": 2 * OBS, "seq": 7})
+        second = client.ask(obs=2 * OBS, seq=7)
         np.testing.assert_array_equal(second["actions"][0], expected(store, 2 * OBS))
         assert second["seq"] == 7 and second["server_timing"]["prev_total_ms"] > first["server_timing"]["infer_ms"]
 
 
-def test_the_health_check_openpi_clients_poll_answers_ok(port: int) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("GET", "/healthz")
-    assert connection.getresponse().read() == b"OK"
-    connection.close()
-
-
 def test_a_policy_and_a_version_have_streams_of_their_own(port: int, store: PolicyStore) -> None:
-    with OpenpiClient(port, "/v1/policies/ur5/versions/2/stream") as client:
-        reply = client.infer({"obs": OBS})
+    with Stream(port, "/v1/policies/ur5/versions/2/stream") as client:
+        reply = client.ask(obs=OBS)
         assert (reply["version"], client.metadata["version"]) == ("2", "2")
         np.testing.assert_array_equal(reply["actions"][0], expected(store, version="2"))
-    with OpenpiClient(port, "/v1/policies/gridworld/stream") as client:
-        assert client.infer({"obs": np.int64(2)})["actions"].tolist() == [expected(store, 2, "gridworld").item()]
-        assert client.infer({"obs": 2})["actions"].shape == (1,)
+    with Stream(port, "/v1/policies/gridworld/stream") as client:
+        assert client.ask(obs=np.int64(2))["actions"].tolist() == [expected(store, 2, "gridworld").item()]
+        assert client.ask(obs=2)["actions"].shape == (1,)
 
 
 def test_observations_come_as_named_elements_lists_batches_and_other_dtypes(port: int, store: PolicyStore) -> None:
-    with OpenpiClient(port) as client:
+    with Stream(port) as client:
         named = {f"element_{i}": value for i, value in enumerate(OBS)}
         for obs in (named, {"obs": named}, {"obs": OBS.tolist()}, {"obs": OBS.astype(">f8")}):
-            np.testing.assert_array_equal(client.infer(obs)["actions"][0], expected(store))
+            np.testing.assert_array_equal(client.ask(**obs)["actions"][0], expected(store))
         batch = np.stack([OBS, -OBS, 3 * OBS])
-        actions = client.infer({"obs": batch})["actions"]
+        actions = client.ask(obs=batch)["actions"]
         assert actions.shape == (3, 1, 6)  # a chunk of one for each, so that no client plays the batch as a chunk
         np.testing.assert_array_equal(actions[:, 0], expected(store, batch))
 
@@ -149,12 +80,12 @@ def test_observations_come_as_named_elements_lists_batches_and_other_dtypes(port
 def test_what_openpis_examples_send_beside_observations_is_ignored(port: int, store: PolicyStore) -> None:
     named = {f"element_{i}": value for i, value in enumerate(OBS)}
     beside = {"prompt": "pick up the block", "env_id": 3}
-    with OpenpiClient(port) as client:
+    with Stream(port) as client:
         assert client.metadata["action_horizon"] == 1
         for request in ({"obs": OBS, **beside}, {"obs": named, **beside, "seq": 1}, {**named, **beside, "reset": True}):
-            np.testing.assert_array_equal(client.infer(request)["actions"][0], expected(store))
-    with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="unknown 'language'"):
-        client.infer({**named, "language": "pick up the block"})
+            np.testing.assert_array_equal(client.ask(**request)["actions"][0], expected(store))
+    with Stream(port) as client:
+        assert "unknown 'language'" in client.ask(**named, language="pick up the block")["error"]
 
 
 def as_msgpack_numpy(array: Any, **changes: Any) -> dict[bytes, Any]:
@@ -164,31 +95,23 @@ def as_msgpack_numpy(array: Any, **changes: Any) -> dict[bytes, Any]:
 
 
 def test_arrays_of_msgpack_numpy_are_read_as_data(port: int, store: PolicyStore) -> None:
-    with OpenpiClient(port) as client:
-        reply = client.infer({"obs": as_msgpack_numpy(OBS)})
+    with Stream(port) as client:
+        reply = client.ask(obs=as_msgpack_numpy(OBS))
         np.testing.assert_array_equal(reply["actions"][0], expected(store))
         named = {
             f"element_{i}": {b"nd": False, b"type": "<f4", b"data": value.tobytes()} for i, value in enumerate(OBS)
         }
-        np.testing.assert_array_equal(client.infer({"obs": named})["actions"][0], expected(store))
+        np.testing.assert_array_equal(client.ask(obs=named)["actions"][0], expected(store))
     for changes in ({"kind": b"O"}, {"kind": b"V"}, {"type": "|O"}, {"type": 7}, {"shape": [28]}, {"data": "x"}):
-        with OpenpiClient(port) as client, pytest.raises(RuntimeError, match="array in the message"):
-            client.infer({"obs": as_msgpack_numpy(OBS, **changes)})
+        with Stream(port) as client:
+            assert "array in the message" in client.ask(obs=as_msgpack_numpy(OBS, **changes))["error"]
 
 
 def test_a_reset_is_taken_where_nothing_is_remembered(port: int, store: PolicyStore) -> None:
     named = {f"element_{i}": value for i, value in enumerate(OBS)}
-    with OpenpiClient(port) as client:
+    with Stream(port) as client:
         for request in ({"obs": OBS, "reset": True}, {**named, "reset": True}):
-            np.testing.assert_array_equal(client.infer(request)["actions"][0], expected(store))
-
-
-def test_exploring_is_repeatable_by_seed(port: int) -> None:
-    with OpenpiClient(port) as client:
-        first, again, other = (
-            client.infer({"obs": OBS, "explore": True, "seed": seed})["actions"].tolist() for seed in (1, 1, 2)
-        )
-    assert first == again != other
+            np.testing.assert_array_equal(client.ask(**request)["actions"][0], expected(store))
 
 
 def array(**changes: Any) -> bytes:
@@ -210,6 +133,8 @@ def array(**changes: Any) -> bytes:
         (pack({"obs": OBS, "sed": 1}), "bad-request", "unknown field 'sed'"),
         (pack({"obs": OBS} | {f"k{i}": 0 for i in range(3000)}), "bad-request", "'k6', 'k7': expected one of deadline"),
         (pack({"obs": OBS, "seed": -1}), "bad-request", "'seed' must be greater than or equal to 0"),
+        *((pack({"obs": OBS, field: number}), "bad-request", f"'{field}'")
+          for field in ("deadline_ms", "timestamp", "seed", "seq") for number in (float("inf"), float("nan"))),
         (pack({"obs": OBS[:26]}), "bad-observation", "expects obs of shape (27,), got (26,)"),
         (pack({"obs": OBS * np.float32(np.nan)}), "bad-observation", "element 0 (element_0) is nan"),
         (pack({"obs": msgpack.ExtType(5, b"x")}), "bad-observation", "cannot read obs"),
@@ -228,62 +153,33 @@ def array(**changes: Any) -> bytes:
     ],
 )  # fmt: skip
 def test_an_error_is_a_text_frame_then_close_1011(port: int, content: bytes | str, code: str, sentence: str) -> None:
-    with OpenpiClient(port) as client:
-        with pytest.raises(RuntimeError) as caught:
-            client.exchange(content)
-        reply = json.loads(str(caught.value))
+    with Stream(port) as client:
+        reply = client.exchange(content)
         assert reply["code"] == code and sentence in reply["error"], reply
         assert client.close_code() == 1011
-
-
-def test_an_unsafe_action_does_not_leave_over_this_protocol_either(port: int) -> None:
-    with OpenpiClient(port, "/v1/policies/unsafe/stream") as client, pytest.raises(RuntimeError, match="unsafe-action"):
-        client.infer({"obs": np.full(27, 100.0)})
 
 
 @pytest.mark.parametrize("path", ["/v1/policies/nobody/stream", "/v1/policies/ur5/versions/99/stream", "/other"])
 def test_a_stream_that_does_not_exist_is_refused_with_404_in_our_form(port: int, path: str) -> None:
     with pytest.raises(InvalidStatus) as caught:
-        OpenpiClient(port, path)
+        Stream(port, path)
     response = caught.value.response
     assert response.status_code == 404
     assert json.loads(response.body or b"")["code"] in ("unknown-policy", "unknown-version")
 
 
-def test_without_a_default_policy_the_root_says_where_to_connect(store: PolicyStore, served: Serve) -> None:
-    with served(create_app(control_of(store), ServerSettings())) as port:
+def test_without_a_default_policy_the_root_says_where_to_connect(store: PolicyStore) -> None:
+    with over_uvicorn(create_app(control_of(store), ServerSettings())) as port:
         with pytest.raises(InvalidStatus) as caught:
-            OpenpiClient(port)
-        assert b"no default policy among gridworld, unsafe, ur5" in (caught.value.response.body or b"")
+            Stream(port)
+        assert b"no default policy among gridworld, ur5" in (caught.value.response.body or b"")
 
 
-def test_a_server_that_is_loading_refuses_streams_with_503(served: Serve) -> None:
-    with served(create_app(control_of(None), ServerSettings())) as port:
+def test_a_server_that_is_loading_refuses_streams_with_503() -> None:
+    with over_uvicorn(create_app(control_of(None), ServerSettings())) as port:
         with pytest.raises(InvalidStatus) as caught:
-            OpenpiClient(port)
+            Stream(port)
         assert caught.value.response.status_code == 503 and caught.value.response.headers["retry-after"] == "1"
-
-
-def test_no_damaged_frame_gets_anything_but_an_answer_or_a_named_error(port: int) -> None:
-    rng = random.Random(0)
-    good = pack({"obs": OBS, "explore": True, "seed": 1, "seq": 2, "deadline_ms": 1000.0})
-    codes: dict[str, int] = {}
-    client = OpenpiClient(port)
-    for number in range(300):
-        damaged = bytearray(good)
-        for _ in range(rng.randint(1, 3)):
-            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
-        try:
-            assert np.isfinite(
-                client.exchange(bytes(damaged[: None if number % 5 else rng.randrange(200)]))["actions"]
-            ).all()
-        except RuntimeError as error:
-            code = json.loads(str(error))["code"]
-            codes[code] = codes.get(code, 0) + 1
-            client.close()
-            client = OpenpiClient(port)
-    client.close()
-    assert set(codes) <= {"bad-request", "bad-observation", "deadline-passed"} and sum(codes.values()) > 50, codes
 
 
 def test_a_client_that_goes_while_it_is_answered_is_no_failure_of_the_server(
@@ -309,7 +205,7 @@ def test_a_client_that_goes_while_it_is_answered_is_no_failure_of_the_server(
 
 
 def test_many_robots_stream_at_once_and_none_gets_anothers_action(port: int, store: PolicyStore) -> None:
-    clients = [OpenpiClient(port) for _ in range(20)]
+    clients = [Stream(port) for _ in range(20)]
     for _ in range(5):
         for index, client in enumerate(clients):
             client.socket.send(pack({"obs": OBS * index, "seq": index}))

@@ -274,7 +274,7 @@ LIES: dict[str, tuple[Lie, str]] = {
     ),
     "endless object": (
         only("2/SHA256SUMS", endless),
-        r"/policies/ur5/2/SHA256SUMS: the storage sends more than the 65,536 bytes that it may$",
+        r"/policies/ur5/2/SHA256SUMS: the storage sent more than the 65,536 bytes allowed$",
     ),
     "endless refusal": (
         only("2/policy.onnx", lambda *reply: (403, *endless(*reply)[1:])),
@@ -284,7 +284,7 @@ LIES: dict[str, tuple[Lie, str]] = {
         only(INDEX, lambda p, s, h, b: (s, h, b[:60])),
         r"/policies/index\.json is not an index of versions",
     ),
-    "endless index": (only(INDEX, endless), r"/policies/index\.json: the storage sends more than the 16,777,216 b"),
+    "endless index": (only(INDEX, endless), r"/policies/index\.json: the storage sent more than the 16,777,216 b"),
     "index is 503": (only(INDEX, busy), r"/policies/index\.json cannot be reached or read"),
 }
 
@@ -318,7 +318,7 @@ def test_a_storage_that_lies_is_told_in_a_sentence_and_what_runs_goes_on(
 def test_a_bundle_is_bounded_by_the_servers_limits(made: Path, storage: Storage, cache: Path) -> None:
     put(made, storage.uri, "1")
     settings = ServerSettings(cache=str(cache), max_policy_bytes=1024)
-    with pytest.raises(BundleError, match=r"ur5/1/policy.onnx: the storage sends more than the 1,024 bytes"):
+    with pytest.raises(BundleError, match=r"ur5/1/policy.onnx: the storage sent more than the 1,024 bytes"):
         load_served([storage.uri], ServedConfig(), settings)
 
 
@@ -676,7 +676,7 @@ def test_a_folder_is_published_to_at_once_and_served_by_path_file_uri_and_http(m
 
 
 HTTP_LIES: dict[str, tuple[str, Callable[[http.server.SimpleHTTPRequestHandler], object], str]] = {
-    "endless": ("/index.json", lambda h: stream(h, {}), "index.json: the storage sends more than the 16,777,216 bytes"),
+    "endless": ("/index.json", lambda h: stream(h, {}), "index.json: the storage sent more than the 16,777,216 bytes"),
     "packed": (
         "/index.json",
         lambda h: stream(h, {"content-encoding": "deflate"}, zlib.compress(bytes(20 << 20), 1)),

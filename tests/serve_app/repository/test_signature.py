@@ -23,7 +23,7 @@ from rlservo.bundle.bundle import SUMS_FILE, Bundle, load_bundle
 from rlservo.errors import BundleError, BundleTamperedError, ConflictError, UsageError
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.repository import repository
-from rlservo.serve_app.repository.publication import publish
+from rlservo.serve_app.repository.publication import next_version, publish
 from rlservo.serve_app.repository.repository import Repository
 from rlservo.serve_app.repository.signature import SIGNATURE_FILE, check_signature, sign
 from rlservo.serve_app.server.settings import ServerSettings
@@ -158,7 +158,7 @@ def test_a_changed_bundle_is_not_what_was_signed(
     attack(bundle)
     changed = load_bundle(bundle.path)
     assert changed.digest != bundle.digest
-    with pytest.raises(BundleError, match=r"model\.sig by team\.pem is for other files than these"):
+    with pytest.raises(BundleError, match=r"model\.sig, made with team\.pem, does not match these files"):
         check_signature(changed, tmp_path / "keys")
 
 
@@ -176,7 +176,7 @@ def test_a_signature_that_leaves_out_the_hashes_is_refused(tmp_path: Path, bundl
     signing.Config().use_elliptic_key_signer(private_key=private).set_hashing_config(config).sign(
         bundle.path, bundle.path / SIGNATURE_FILE
     )
-    with pytest.raises(BundleError, match=r"model\.sig by team\.pem leaves out SHA256SUMS"):
+    with pytest.raises(BundleError, match=r"model\.sig, made with team\.pem, does not cover SHA256SUMS"):
         check_signature(bundle, tmp_path / "keys")
 
 
@@ -195,7 +195,7 @@ def test_an_issuer_stands_for_its_certificates_until_they_expire(tmp_path: Path,
     assert check_signature(bundle, issuers) == "ca.pem"
     (tmp_path / "old").mkdir()
     private, leaf, issuers = certified(tmp_path / "old", (-200, -100))
-    with pytest.raises(BundleError, match="by none of the keys"):
+    with pytest.raises(BundleError, match="with none of the keys"):
         check_signature(bundle, issuers)
     file = sign(bundle, private, leaf)
     with pytest.raises(BundleError, match=r"has a certificate of 'CN=leaf' that is valid from \d{4}-\d\d-\d\d to"):
@@ -210,7 +210,7 @@ def test_an_issuer_stands_for_its_certificates_until_they_expire(tmp_path: Path,
         {"x509CertificateChain": {"certificates": [{"raw_bytes": each["rawBytes"]} for each in chain["certificates"]]}},
     ):
         file.write_text(json.dumps({**signature, "verificationMaterial": {**rest, **material}}))
-        with pytest.raises(BundleError, match="is no signature of OpenSSF Model Signing"):
+        with pytest.raises(BundleError, match="is not an OpenSSF Model Signing signature"):
             check_signature(bundle, issuers)
 
 
@@ -244,7 +244,7 @@ def test_a_certificate_for_other_uses_signs_nothing(tmp_path: Path, bundle: Bund
 def test_what_is_no_signature_is_said(tmp_path: Path, bundle: Bundle, content: bytes) -> None:
     write(tmp_path, "team")
     (bundle.path / SIGNATURE_FILE).write_bytes(content)
-    with pytest.raises(BundleError, match="is no signature of OpenSSF Model Signing"):
+    with pytest.raises(BundleError, match="is not an OpenSSF Model Signing signature"):
         check_signature(bundle, tmp_path / "keys")
 
 
@@ -278,6 +278,17 @@ def test_keys_that_cannot_be_used_are_named(tmp_path: Path, bundle: Bundle) -> N
     assert key
 
 
+def test_a_key_in_a_file_of_another_name_is_warned_of(
+    tmp_path: Path, bundle: Bundle, caplog: pytest.LogCaptureFixture
+) -> None:
+    (_, private), _ = write(tmp_path, "team"), write(tmp_path, "other")
+    sign(bundle, private)
+    (tmp_path / "keys" / "team.pem").rename(tmp_path / "keys" / "team.pub")
+    with pytest.raises(BundleError, match="with none of the keys"):
+        check_signature(bundle, tmp_path / "keys")
+    assert [one for one in caplog.messages if "not *.pem, so not used as keys: team.pub" in one]
+
+
 def test_keys_are_changed_while_serving(tmp_path: Path) -> None:
     """Each load reads the keys: a new one is trusted at once, a removed one no more; what is loaded stays."""
     root, privates = tmp_path / "policies", {name: write(tmp_path, name)[1] for name in ("old", "new")}
@@ -293,13 +304,13 @@ def test_keys_are_changed_while_serving(tmp_path: Path) -> None:
 
     async def rotate() -> None:
         assert await load("1") == "1"
-        with pytest.raises(BundleError, match=r"by none of the keys in .* \(old\.pem\)"):
+        with pytest.raises(BundleError, match=r"with none of the keys in .* \(old\.pem\)"):
             await load("2")
         shutil.copy(new, tmp_path / "keys")
         assert await load("2") == "2"
         (tmp_path / "keys" / "old.pem").unlink()
         assert [await load(version) for version in "13"] == ["1", "3"]
-        with pytest.raises(BundleError, match=r"by none of the keys in .* \(new\.pem\)"):
+        with pytest.raises(BundleError, match=r"with none of the keys in .* \(new\.pem\)"):
             await load("4")
 
     asyncio.run(rotate())
@@ -350,7 +361,7 @@ def test_a_signature_is_published_fetched_and_replaced(tmp_path: Path, bundle: B
     with pytest.raises(ConflictError, match="with this signature"):
         publish(bundle, storage.uri)
     (tmp_path / "keys" / "old.pem").unlink()
-    with pytest.raises(BundleError, match="by none of the keys"):
+    with pytest.raises(BundleError, match="with none of the keys"):
         serve()
     sign(bundle, new)
     publish(bundle, storage.uri)
@@ -362,13 +373,20 @@ def test_a_signature_is_published_fetched_and_replaced(tmp_path: Path, bundle: B
         assert check_signature(load_bundle(folder), tmp_path / "keys") == "renamed.pem"
 
 
+def test_what_is_no_signature_is_refused_before_anything_is_published(bundle: Bundle, storage: Storage) -> None:
+    (bundle.path / SIGNATURE_FILE).write_bytes(b"{}")
+    with pytest.raises(BundleError, match="is not an OpenSSF Model Signing signature"):
+        publish(bundle, storage.uri)
+    assert next_version(storage.uri, "ur5") == "1"
+
+
 def test_links_in_a_bundle_neither_overwrite_nor_publish_a_file(tmp_path: Path, bundle: Bundle) -> None:
     """A bundle may come from anyone: signing it must not write to, and publishing it not read, what a link names."""
     mine = tmp_path / "mine"
     mine.write_text("secret")
     for name in (".model.sig.new", SIGNATURE_FILE):
         (bundle.path / name).symlink_to(mine)
-    with pytest.raises(BundleError, match=r"model\.sig is no signature"):
+    with pytest.raises(BundleError, match=r"model\.sig is not an OpenSSF"):
         publish(bundle, str(tmp_path / "published"))
     assert not list((tmp_path / "published").rglob(SIGNATURE_FILE))
     file = sign(bundle, write(tmp_path, "team")[1])

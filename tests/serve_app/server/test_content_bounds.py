@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ import msgpack
 import numpy as np
 import orjson
 import pytest
-import websockets.sync.client
 
 from rlservo.bundle.bundle import read_contract
 from rlservo.bundle.contract import Contract
@@ -28,7 +26,9 @@ from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.content_bounds import ContentBounds
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.sessions.request import Request
+from servers import over_uvicorn
 from stores import control_of, load_store
+from streams import Stream
 
 ROWS = 64
 MANY = 300_000
@@ -75,8 +75,8 @@ def app(ur5: Path) -> PolicyApp:
 
 
 @pytest.fixture(scope="module")
-def http(app: PolicyApp, served: Callable[[Any], AbstractContextManager[int]]) -> Iterator[httpx.Client]:
-    with served(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
+def http(app: PolicyApp) -> Iterator[httpx.Client]:
+    with over_uvicorn(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}", trust_env=False) as client:
         yield client
 
 
@@ -90,10 +90,8 @@ def test_a_body_of_more_than_a_batch_needs_is_not_parsed(http: httpx.Client, nam
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_a_frame_of_more_than_a_batch_needs_is_not_unpacked(http: httpx.Client, name: str) -> None:
-    with websockets.sync.client.connect(f"ws://127.0.0.1:{http.base_url.port}/") as stream:
-        stream.recv()
-        stream.send(FRAMES[name])
-        assert json.loads(stream.recv())["code"] == "too-large"
+    with Stream(http.base_url.port or 0) as stream:
+        assert stream.exchange(FRAMES[name])["code"] == "too-large"
 
 
 def parameters(place: Any, count: int) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import os
 import shutil
@@ -11,10 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import msgpack
 import pytest
-import websockets.sync.client
-from websockets.exceptions import ConnectionClosed
 
 from rlservo.errors import UsageError
 from rlservo.serve_app.server import current_keys
@@ -22,6 +18,7 @@ from rlservo.serve_app.server.api_keys import Keys, new_key
 from rlservo.serve_app.server.current_keys import CurrentKeys
 from rlservo.serve_app.server.settings import ServerSettings
 from servers import ask, served_in_thread
+from streams import Stream
 from waiting import wait_for
 
 OLD, OLD_LINE = new_key("cell-7")
@@ -195,19 +192,12 @@ def test_a_file_system_that_hangs_is_seen_in_the_metrics_and_stops_nobody(
 def test_a_stream_opened_with_a_removed_key_gets_no_further_action(
     replicas: tuple[int, int], file: Path, query: str
 ) -> None:
-    address, headers = f"ws://127.0.0.1:{replicas[0]}/v1/policies/ur5/stream{query}", {"x-api-key": OLD}
-    frame = msgpack.packb({"obs": OBS})
-    with websockets.sync.client.connect(address, additional_headers=headers) as stream:
-        stream.recv()
-        stream.send(frame)
-        assert "actions" in msgpack.unpackb(stream.recv())
+    with Stream(replicas[0], f"/v1/policies/ur5/stream{query}", x_api_key=OLD) as stream:
+        assert "actions" in stream.ask(obs=OBS)
         file.write_text(f"{OLD_LINE}\n{NEW_LINE}\n")  # a change that leaves this key alone
         wait_for(lambda: status(replicas[0], NEW) == 200)
-        stream.send(frame)
-        assert "actions" in msgpack.unpackb(stream.recv())
+        assert "actions" in stream.ask(obs=OBS)
         file.write_text(f"{NEW_LINE}\n")
         wait_for(lambda: status(replicas[0], OLD) == 401)
-        stream.send(frame)
-        assert json.loads(stream.recv())["code"] == "unauthenticated"
-        with pytest.raises(ConnectionClosed):
-            stream.recv()
+        assert stream.ask(obs=OBS)["code"] == "unauthenticated"
+        assert stream.close_code() is not None

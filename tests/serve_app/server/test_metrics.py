@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import msgpack
-import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
+from bundles import controlled, write_box_policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.repository.repository import Repository
-from rlservo.serve_app.server.exposition import exposition
 from rlservo.serve_app.server.metrics import Metrics
 from rlservo.serve_app.server.request_handler import RequestHandler
+from rlservo.serve_app.server.sampled_metrics import exposition
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.plan_commands import Load, Unload
 from rlservo.serve_app.versions.plan_follower import PlanFollower
 from rlservo.serve_app.versions.version_loader import VersionLoader
-from servers import exchange
+from servers import exchange, over_uvicorn
 from stores import control_of, load_store
+from streams import Stream
 
 OBS = [0.1] * 27
 
 
-def test_requests_are_counted_by_policy_version_protocol_and_outcome(
-    policies: Path, served: Callable[[Any], AbstractContextManager[int]]
-) -> None:
+def test_requests_are_counted_by_policy_version_protocol_and_outcome(policies: Path) -> None:
     store = load_store(policies)
     app = create_app(control_of(store), ServerSettings(default_policy="ur5"), replica="r1")
-    with served(app) as port:
+    with over_uvicorn(app) as port:
 
         def call(path: str, body: Any = None) -> tuple[int, bytes]:
             reply = exchange(port, "GET" if body is None else "POST", path, body)
@@ -58,10 +54,8 @@ def test_requests_are_counted_by_policy_version_protocol_and_outcome(
         for name in ("made-up-1", "made-up-2"):
             assert call(f"/v1/policies/{name}/act", {"obs": OBS})[0] == 404
         assert call("/v1/policies/ur5/versions/77/act", {"obs": OBS})[0] == 404
-        with websockets.sync.client.connect(f"ws://127.0.0.1:{port}/") as stream:
-            stream.recv()
-            stream.send(msgpack.packb({"obs": OBS}))
-            stream.recv()
+        with Stream(port) as stream:
+            stream.ask(obs=OBS)
             seen = scrape()
             assert seen["rlservo_streams", "ur5"] == 1
         # Labels in the order of their names: code, policy, protocol, version (le first in buckets).
@@ -89,11 +83,9 @@ def test_requests_are_counted_by_policy_version_protocol_and_outcome(
         assert again == seen
 
 
-def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
-    box_policy: Any, controlled: Any, tmp_path: Path
-) -> None:
+def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(tmp_path: Path) -> None:
     for version in ("1", "2"):
-        box_policy(tmp_path, version=version)
+        write_box_policy(tmp_path, version=version)
     with controlled(tmp_path, config={"policies": {"ur5": {"aliases": {"production": "1"}}}}) as control:
         handler = RequestHandler(control, ServerSettings(), replica="r")
 
@@ -110,9 +102,9 @@ def test_a_version_that_is_unloaded_disappears_and_the_plan_is_numbered(
         assert loaded() == {"1": 1.0, "2": 0.0}
 
 
-def test_versions_that_a_process_could_not_load_are_counted(box_policy: Any, controlled: Any, tmp_path: Path) -> None:
+def test_versions_that_a_process_could_not_load_are_counted(tmp_path: Path) -> None:
     for version in ("1", "2"):
-        box_policy(tmp_path, version=version)
+        write_box_policy(tmp_path, version=version)
     config = {"policies": {"ur5": {"aliases": {"production": "1"}}}}
     with controlled(tmp_path, config=config) as control:
         for damaged in (0, 1):

@@ -6,8 +6,7 @@ import contextlib
 import json
 import logging
 import re
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from bundles import write_box_policy
 from rlservo.bundle import bundle as bundle_files
 from rlservo.bundle.contract import BakedStep
 from rlservo.bundle.spaces import BoxSpec
@@ -25,7 +25,7 @@ from rlservo.policy.drift import EVERY, Drift
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.logs import LOGGER, configure
 from rlservo.serve_app.server.settings import ServerSettings
-from servers import exchange
+from servers import exchange, over_uvicorn
 from stores import control_of, load_store
 
 MEAN, STD = np.linspace(-2, 2, 27), np.linspace(0.5, 3, 27)
@@ -34,9 +34,9 @@ SECRET = 0.7316523
 
 
 @pytest.fixture(scope="module")
-def filtered(box_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def filtered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ur5 whose contract says what its filter saw in training, as the exporter writes it."""
-    folder = box_policy(tmp_path_factory.mktemp("filtered"))
+    folder = write_box_policy(tmp_path_factory.mktemp("filtered"))
     contract = bundle_files.read_contract(folder)
     values = {"count": 9000, "mean": MEAN.tolist(), "std": STD.tolist(), "clip": None, "demean": True, "destd": True}
     steps = (BakedStep(step="mean_std_filter", values=values), *contract.baked_in[1:])
@@ -100,11 +100,9 @@ def test_a_policy_without_a_filter_has_no_drift(ur5: Path, filtered: Path) -> No
     assert Drift.of(contract.model_copy(update={"observation_space": other})) is None
 
 
-def test_drift_of_served_requests_is_a_metric_per_element(
-    filtered: Path, served: Callable[[Any], AbstractContextManager[int]]
-) -> None:
+def test_drift_of_served_requests_is_a_metric_per_element(filtered: Path) -> None:
     store = load_store(filtered)
-    with served(create_app(control_of(store), ServerSettings(), replica="r")) as port:
+    with over_uvicorn(create_app(control_of(store), ServerSettings(), replica="r")) as port:
         obs = MEAN + 2 * STD * (np.arange(27) == 7)
         for _ in range(3 * EVERY):
             assert post(port, "/v1/policies/ur5/act", {"obs": obs.tolist()})[0] == 200
@@ -117,13 +115,11 @@ def test_drift_of_served_requests_is_a_metric_per_element(
 
 
 @pytest.mark.parametrize("values", [False, True])
-def test_the_log_says_what_happened_and_values_only_when_asked(
-    ur5: Path, served: Callable[[Any], AbstractContextManager[int]], log_file: Path, values: bool
-) -> None:
+def test_the_log_says_what_happened_and_values_only_when_asked(ur5: Path, log_file: Path, values: bool) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True, log_values=values)
     store = load_store(ur5)
     configure(settings, replica="r9")
-    with served(create_app(control_of(store), settings)) as port:
+    with over_uvicorn(create_app(control_of(store), settings)) as port:
         obs = [SECRET] * 27
         assert post(port, "/v1/policies/ur5/act", {"obs": obs}, x_request_id="cell-7/1")[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [f"{SECRET}"] * 27}, x_request_id='x"\\{}')[0] == 422
@@ -145,13 +141,11 @@ def test_the_log_says_what_happened_and_values_only_when_asked(
     assert str(SECRET)[:6] not in text or values
 
 
-def test_requests_on_streams_are_logged_like_others(
-    ur5: Path, served: Callable[[Any], AbstractContextManager[int]], log_file: Path
-) -> None:
+def test_requests_on_streams_are_logged_like_others(ur5: Path, log_file: Path) -> None:
     settings = ServerSettings(log_file=str(log_file), log_requests=True)
     store = load_store(ur5)
     configure(settings)
-    with served(create_app(control_of(store), settings)) as port:
+    with over_uvicorn(create_app(control_of(store), settings)) as port:
         address = f"ws://127.0.0.1:{port}/v1/policies/ur5"
 
         def connect(path: str) -> Any:
@@ -186,11 +180,9 @@ def test_requests_on_streams_are_logged_like_others(
     assert str(SECRET)[:6] not in log_file.read_text()
 
 
-def test_the_dashboard_asks_for_metrics_that_exist(
-    filtered: Path, tmp_path: Path, served: Callable[[Any], AbstractContextManager[int]]
-) -> None:
+def test_the_dashboard_asks_for_metrics_that_exist(filtered: Path, tmp_path: Path) -> None:
     store = load_store(filtered)
-    with served(create_app(control_of(store), ServerSettings(record=str(tmp_path)), replica="r")) as port:
+    with over_uvicorn(create_app(control_of(store), ServerSettings(record=str(tmp_path)), replica="r")) as port:
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27})[0] == 200
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0]})[0] == 422
         assert post(port, "/v1/policies/ur5/act", {"obs": [0.0] * 27, "session_id": "s", "reset": True})[0] == 200

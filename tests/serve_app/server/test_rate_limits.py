@@ -5,33 +5,30 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import grpc
-import msgpack
 import pytest
-import websockets.sync.client
 from typer.testing import CliRunner
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import InvalidStatus
 
+from bundles import controlled
+from grpc_calls import GrpcCall, answered, infer_request
 from rlservo.client.policy_client import PolicyClient
 from rlservo.client.stream_client import StreamClient
 from rlservo.deploy.cli import app as command_line
 from rlservo.errors import RateLimitError, UsageError
 from rlservo.serve_app.protocols.asgi_app import PolicyApp, create_app
 from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
-from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.api_keys import Key, Keys, RateLimit, Role, new_key
 from rlservo.serve_app.server.rate_limits import RateLimits
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
-from servers import exchange
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import exchange, over_uvicorn
 from stores import control_of, load_store
-
-Serve = Callable[[Any], AbstractContextManager[int]]
+from streams import Stream
 
 OBS = [0.1] * 27
 BURST = 3
@@ -52,8 +49,8 @@ def app(store: PolicyStore) -> PolicyApp:
 
 
 @pytest.fixture
-def port(app: PolicyApp, served: Serve) -> Iterator[int]:
-    with served(app) as port:
+def port(app: PolicyApp) -> Iterator[int]:
+    with over_uvicorn(app) as port:
         yield port
 
 
@@ -86,13 +83,11 @@ def test_a_key_gets_its_burst_over_all_of_http_and_then_429_with_a_time_to_wait(
     assert 'key="cell-8"' not in text and 'code="rate-limited"' in text
 
 
-def test_attempts_at_what_the_key_may_not_do_count_as_well(
-    policies: Path, controlled: Any, served: Serve, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_attempts_at_what_the_key_may_not_do_count_as_well(policies: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO", logger="rlservo")
     with controlled(policies) as control:
         app = create_app(control, ServerSettings(api_keys=LIMITED_LINE))
-        with served(app) as port:
+        with over_uvicorn(app) as port:
             load = ("POST", "/v1/admin/policies/ur5/load", {})
             assert [ask(port, *load)[0] for _ in range(BURST + 1)] == [403] * BURST + [429]
     entries = [record.__dict__["fields"] for record in caplog.records if record.name == "rlservo.administration"]
@@ -112,34 +107,21 @@ def test_our_client_raises_it_at_once_and_says_how_long(port: int) -> None:
 
 
 def test_a_websockets_frames_count_and_one_too_many_ends_it_or_not(port: int) -> None:
-    def connect(query: str = "", key: str = LIMITED) -> Any:
-        headers = {"authorization": f"Bearer {key}"}
-        return websockets.sync.client.connect(f"ws://127.0.0.1:{port}/{query}", additional_headers=headers)
+    def connect(query: str = "", key: str = LIMITED) -> Stream:
+        return Stream(port, f"/{query}", authorization=f"Bearer {key}")
 
-    frame = msgpack.packb({"obs": OBS})
     with connect("?errors=keep") as stream:  # the upgrade is the first
-        stream.recv()
-        for _ in range(BURST - 1):
-            stream.send(frame)
-            assert isinstance(stream.recv(), bytes)
+        assert all("actions" in stream.ask(obs=OBS) for _ in range(BURST - 1))
         for _ in range(2):
-            stream.send(frame)
-            reply = stream.recv()
-            assert isinstance(reply, str) and json.loads(reply)["code"] == "rate-limited"
+            assert stream.ask(obs=OBS)["code"] == "rate-limited"
     with pytest.raises(InvalidStatus) as caught:
         connect()
     assert caught.value.response.status_code == 429
     assert 900 < int(caught.value.response.headers["retry-after"]) <= 1000
     with connect(key=ALSO_LIMITED) as stream:
-        stream.recv()
-        for _ in range(BURST - 1):
-            stream.send(frame)
-            assert isinstance(stream.recv(), bytes)
-        stream.send(frame)
-        assert json.loads(stream.recv())["code"] == "rate-limited"
-        with pytest.raises(ConnectionClosed):
-            stream.recv()
-        assert stream.close_code == 1011
+        assert all("actions" in stream.ask(obs=OBS) for _ in range(BURST - 1))
+        assert stream.ask(obs=OBS)["code"] == "rate-limited"
+        assert stream.close_code() == 1011
 
 
 def test_our_stream_raises_it_and_stays_open(port: int) -> None:
@@ -152,47 +134,8 @@ def test_our_stream_raises_it_and_stays_open(port: int) -> None:
         assert client.reconnects == 0
 
 
-class Context:
-    """What a gRPC call tells, and is told."""
-
-    def __init__(self, key: str) -> None:
-        self.metadata = (("authorization", f"Bearer {key}"),)
-        self.code: Any = None
-        self.details = ""
-        self.trailing: dict[str, str] = {}
-
-    def peer(self) -> str:
-        return "ipv4:127.0.0.1:4711"
-
-    def invocation_metadata(self) -> Any:
-        return self.metadata
-
-    def set_code(self, code: Any) -> None:
-        self.code = code
-
-    def set_details(self, details: str) -> None:
-        self.details = details
-
-    def set_trailing_metadata(self, pairs: Any) -> None:
-        self.trailing.update(pairs)
-
-
-def infer(*, explore: bool = False) -> bytes:
-    request = messages.ModelInferRequest(model_name="ur5")
-    request.inputs.add(name="obs", datatype="FP32", shape=[1, 27]).contents.fp32_contents.extend(OBS)
-    request.parameters["explore"].bool_param = explore
-    return bytes(request.SerializeToString())
-
-
 def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
-    async def calls() -> list[Context]:
-        service, contexts = Grpc(app.handler), []
-        for _ in range(BURST + 1):
-            contexts.append(Context(LIMITED))
-            await service.answer("ModelInfer", infer(), contexts[-1])
-        return contexts
-
-    *good, refused = asyncio.run(calls())
+    *good, refused = (answered(app.handler, infer_request([OBS]), key=LIMITED)[1] for _ in range(BURST + 1))
     assert [context.code for context in good] == [None] * BURST
     assert refused.code is grpc.StatusCode.RESOURCE_EXHAUSTED and "'cell-7' allows" in refused.details
     assert refused.trailing["rlservo-code"] == "rate-limited" and 900 < int(refused.trailing["retry-after"]) <= 1000
@@ -201,13 +144,13 @@ def test_grpc_says_resource_exhausted(app: PolicyApp) -> None:
 def test_a_grpc_streams_messages_count_and_it_goes_on(app: PolicyApp) -> None:
     async def requests() -> AsyncIterator[bytes]:
         for _ in range(BURST + 2):
-            yield infer()
+            yield infer_request([OBS]).SerializeToString()
 
     async def replies() -> list[str]:
         stream = Grpc(app.handler).stream(requests(), context)
         return [reply.error_message async for reply in stream]
 
-    context = Context(LIMITED)
+    context = GrpcCall(LIMITED)
     errors = asyncio.run(replies())
     # Opening it is a request, too.
     assert errors[: BURST - 1] == [""] * (BURST - 1) and all("allows" in error for error in errors[BURST - 1 :])
@@ -216,15 +159,14 @@ def test_a_grpc_streams_messages_count_and_it_goes_on(app: PolicyApp) -> None:
 
 def test_grpc_refuses_exploring_to_a_key_for_actions_alone(app: PolicyApp) -> None:
     async def requests() -> AsyncIterator[bytes]:
-        yield infer(explore=True)
-        yield infer()
+        yield infer_request([OBS], explore=True).SerializeToString()
+        yield infer_request([OBS]).SerializeToString()
 
-    async def calls() -> tuple[Context, list[str]]:
-        service, context = Grpc(app.handler), Context(FREE)
-        await service.answer("ModelInfer", infer(explore=True), context)
-        return context, [reply.error_message async for reply in service.stream(requests(), Context(FREE))]
+    async def replies() -> list[str]:
+        return [reply.error_message async for reply in Grpc(app.handler).stream(requests(), GrpcCall(FREE))]
 
-    refused, streamed = asyncio.run(calls())
+    _, refused = answered(app.handler, infer_request([OBS], explore=True), key=FREE)
+    streamed = asyncio.run(replies())
     assert refused.code is grpc.StatusCode.PERMISSION_DENIED and "may not request exploring" in refused.details
     assert "may not request exploring" in streamed[0] and streamed[1] == ""
 

@@ -12,27 +12,27 @@ from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
-import websockets.sync.client
-from websockets.exceptions import ConnectionClosed
 
 from rlservo.errors import OverloadedError
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.load_shedding import LoadShedding
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import over_uvicorn
 from stores import control_of, load_store
+from streams import Stream
+from waiting import wait_for
 
 OBS = np.random.default_rng(8).standard_normal((4096, 27)).astype(np.float32)
 Serve = Callable[..., AbstractContextManager[int]]
 
 
 @pytest.fixture(scope="module")
-def serve(policies: Path, served: Callable[[Any], AbstractContextManager[int]]) -> Serve:
+def serve(policies: Path) -> Serve:
     store = load_store(policies)
-    return lambda **settings: served(create_app(control_of(store), ServerSettings(**settings)))
+    return lambda **settings: over_uvicorn(create_app(control_of(store), ServerSettings(**settings)))
 
 
 def request(body: bytes, *, path: str = "/v1/policies/ur5/act") -> bytes:
@@ -114,32 +114,24 @@ def test_health_is_told_when_there_is_too_much_to_do(serve: Serve) -> None:
 
 def test_a_stream_too_many_is_refused_and_one_that_closes_makes_room(serve: Serve) -> None:
     with serve(max_streams=1, default_policy="ur5") as port:
-        url = f"ws://127.0.0.1:{port}/"
-        with websockets.sync.client.connect(url) as first:
-            first.recv()
-            with websockets.sync.client.connect(url) as second:
-                assert json.loads(second.recv())["code"] == "over-capacity"
-            first.send(msgpack.packb({"obs": [0.0] * 27}))
-            assert msgpack.unpackb(first.recv())["policy"] == "ur5"
-        time.sleep(0.1)
-        with websockets.sync.client.connect(url) as third:
-            assert msgpack.unpackb(third.recv())["policy"] == "ur5"
+
+        def refusal() -> str:
+            with Stream(port) as stream:
+                return str(stream.metadata.get("code", ""))
+
+        with Stream(port) as first:
+            assert refusal() == "over-capacity"
+            assert first.ask(obs=[0.0] * 27)["policy"] == "ur5"
+        wait_for(lambda: not refusal())
 
 
 def test_a_silent_stream_is_closed_and_a_busy_one_is_not(serve: Serve) -> None:
-    with (
-        serve(stream_idle_s=0.5, default_policy="ur5") as port,
-        websockets.sync.client.connect(f"ws://127.0.0.1:{port}/") as stream,
-    ):
-        stream.recv()
+    with serve(stream_idle_s=0.5, default_policy="ur5") as port, Stream(port) as stream:
         for _ in range(8):
             time.sleep(0.1)
-            stream.send(msgpack.packb({"obs": [0.0] * 27}))
-            stream.recv()
+            assert "actions" in stream.ask(obs=[0.0] * 27)
         started = time.perf_counter()
-        with pytest.raises(ConnectionClosed) as caught:
-            stream.recv(timeout=10)
-        assert caught.value.rcvd is not None and caught.value.rcvd.code == 1001
+        assert stream.close_code() == 1001
         assert 0.3 < time.perf_counter() - started < 5
 
 

@@ -9,7 +9,6 @@ import stat
 import threading
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,10 +30,8 @@ from rlservo.serve_app.server.api_keys import new_key
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.request_recorder import RequestRecorder
 from rlservo.serve_app.server.settings import ServerSettings
-from servers import exchange
+from servers import exchange, over_uvicorn
 from stores import control_of, load_store
-
-Serve = Callable[[Any], AbstractContextManager[int]]
 
 
 @dataclass
@@ -67,14 +64,16 @@ class Server:
 
 
 @pytest.fixture
-def start(recurrent: Path, ur5: Path, served: Serve, tmp_path: Path) -> Iterator[Callable[..., Server]]:
+def start(recurrent: Path, ur5: Path, tmp_path: Path) -> Iterator[Callable[..., Server]]:
     """A function that serves three recurrent policies and ur5, recording."""
     with contextlib.ExitStack() as stack:
 
         def serve(options: dict[str, PolicyOptions] | None = None, **settings: Any) -> Server:
             store = load_store(recurrent, ur5, options=options)
             app = create_app(control_of(store), ServerSettings(record=str(tmp_path / "recorded"), **settings))
-            server = Server(stack.enter_context(served(app)), tmp_path / "recorded", app.handler.recorder, app.handler)
+            server = Server(
+                stack.enter_context(over_uvicorn(app)), tmp_path / "recorded", app.handler.recorder, app.handler
+            )
             stack.callback(server.recorder.close)
             return server
 

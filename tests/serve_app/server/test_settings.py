@@ -26,6 +26,7 @@ def test_arguments_win_over_the_environment_over_the_defaults() -> None:
             r"RLSERVO_POLICY_OPTIONS is not usable at 'ur5.out_of_bound': .*known: out_of_bounds, .*, record$",
         ),
         ({"colour": 1}, {}, "known: threads"),
+        ({}, {"RLSERVO_SESSION_STORE": "redis:/x"}, "RLSERVO_SESSION_STORE is not usable: expected memory, or a URL"),
     ],
 )
 def test_a_setting_that_cannot_be_used_is_named(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,10 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-import websockets.sync.client
 
+from bundles import write_box_policy, write_leaky_policy
+from grpc_calls import GrpcCall, answered, infer_request
 from rlservo.bundle.contract import TensorSpec
-from rlservo.client.formats.msgpack_arrays import pack, unpack
 from rlservo.client.policy_client import PolicyClient
 from rlservo.client.stream_client import StreamClient
 from rlservo.errors import RequestError, SessionLostError, UnknownVersionError
@@ -23,16 +21,15 @@ from rlservo.policy.options import PolicyOptions
 from rlservo.policy.policy import Policy
 from rlservo.policy.recurrent_state import StateTensors
 from rlservo.serve_app.protocols.asgi_app import create_app
-from rlservo.serve_app.protocols.open_inference.grpc_service import Grpc
-from rlservo.serve_app.protocols.open_inference.oip_messages import messages
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.versions.deployment_plan import PolicyPlan
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import over_uvicorn
 from stores import control_of, store_of
+from streams import Stream
 
 OBS = [0.5, -0.25, 1.0]
 LIMIT = 0.05
-Serve = Callable[[Any], AbstractContextManager[int]]
 
 
 @dataclass
@@ -57,23 +54,23 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def versions(leaky_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Policy]:
+def versions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Policy]:
     """Three graphs that take each other's states: two versions, and the second one exported again."""
     root = tmp_path_factory.mktemp("leaky")
     again = tmp_path_factory.mktemp("again")
     return {
-        "1": Policy.load(leaky_policy(root, version="1", seed=1)),
-        "2": Policy.load(leaky_policy(root, version="2", seed=2)),
-        "2 again": Policy.load(leaky_policy(again, version="2", seed=3)),
-        "other": Policy.load(leaky_policy(root, name="other", seed=4)),
+        "1": Policy.load(write_leaky_policy(root, version="1", seed=1)),
+        "2": Policy.load(write_leaky_policy(root, version="2", seed=2)),
+        "2 again": Policy.load(write_leaky_policy(again, version="2", seed=3)),
+        "other": Policy.load(write_leaky_policy(root, name="other", seed=4)),
     }
 
 
 @pytest.fixture(scope="module")
-def everything(versions: dict[str, Policy], served: Serve) -> Iterator[Server]:
+def everything(versions: dict[str, Policy]) -> Iterator[Server]:
     held: list[Server] = []
     app = create_app(control_of(lambda: held[0].store), ServerSettings())
-    with served(app) as port:
+    with over_uvicorn(app) as port:
         held.append(Server(f"http://127.0.0.1:{port}", app, store_of(versions["1"])))
         yield held[0]
 
@@ -165,45 +162,13 @@ def test_the_open_inference_protocol_tells_and_takes_whose_a_state_is(
     assert server.infer("leaky", {"obs": [OBS]}, state_policy=owner, sequence_start=True)[1]["model_version"] == "2"
 
 
-class Call:
-    """What a gRPC method is given of its call, and tells it."""
-
-    code = details = None
-
-    def peer(self) -> str:
-        return "ipv4:127.0.0.1:1"
-
-    def invocation_metadata(self) -> tuple[tuple[str, str], ...]:
-        return ()
-
-    def set_trailing_metadata(self, metadata: Any) -> None:
-        self.trailing = metadata
-
-    def set_code(self, code: Any) -> None:
-        self.code = code
-
-    def set_details(self, details: str) -> None:
-        self.details = details
-
-
 def test_so_does_grpc(server: Server, versions: dict[str, Policy]) -> None:
-    grpc = Grpc(server.app.handler)
-
-    def infer(state: bytes | None, **parameters: Any) -> tuple[Any, Call]:
-        request = messages.ModelInferRequest(model_name="leaky")
-        request.inputs.add(name="obs", datatype="FP32", shape=[1, 3])
-        request.raw_input_contents.append(np.float32(OBS).tobytes())
+    def infer(state: bytes | None, **parameters: Any) -> tuple[Any, GrpcCall]:
+        request = infer_request([OBS], "leaky", **parameters)
         if state is not None:
             request.inputs.add(name="state_in.h", datatype="FP32", shape=[1, 2])
             request.raw_input_contents.append(state)
-        for name, value in parameters.items():
-            setattr(request.parameters[name], "bool_param" if value is True else "string_param", value)
-        context = Call()
-
-        async def answer() -> Any:
-            return await grpc.answer("ModelInfer", request.SerializeToString(), context)
-
-        return asyncio.run(answer()), context
+        return answered(server.app.handler, request)
 
     first, _ = infer(None, sequence_start=True)
     state, owner = first.raw_output_contents[1], first.parameters["state_policy"].string_param
@@ -211,25 +176,20 @@ def test_so_does_grpc(server: Server, versions: dict[str, Policy]) -> None:
     second, _ = infer(state, state_policy=owner)
     assert second.model_version == "1"
     _, refused = infer(state)
-    assert "the parameter 'state_policy'" in str(refused.details)
+    assert "the parameter 'state_policy'" in refused.details
 
 
 def test_a_stream_hands_a_carried_state_to_its_version(server: Server, versions: dict[str, Policy]) -> None:
-    def ask(socket: Any, **request: Any) -> Any:
-        socket.send(pack({"obs": np.float32(OBS), **request}))
-        return unpack(reply) if isinstance(reply := socket.recv(), bytes) else reply
-
-    address = f"{server.url.replace('http', 'ws')}/v1/policies/leaky/stream?errors=keep"
-    with websockets.sync.client.connect(address) as socket:
-        socket.recv()
-        first = ask(socket, state={})
+    port, path = int(server.url.rpartition(":")[2]), "/v1/policies/leaky/stream?errors=keep"
+    obs = np.float32(OBS)
+    with Stream(port, path) as stream:
+        first = stream.ask(obs=obs, state={})
     server.store = promoted(versions)
-    with websockets.sync.client.connect(address) as socket:  # the connection broke meanwhile
-        assert unpack(socket.recv())["version"] == "2"
-        second = ask(socket, state=first["state"])
+    with Stream(port, path) as stream:  # the connection broke meanwhile
+        assert stream.metadata["version"] == "2"
+        second = stream.ask(obs=obs, state=first["state"])
         assert second["version"] == "1"
-        bare = {"h": first["state"]["h"]}
-        assert "does not name its version" in ask(socket, state=bare)
+        assert "does not name its version" in stream.ask(obs=obs, state={"h": first["state"]["h"]})["error"]
     np.testing.assert_allclose(second["actions"][0], in_process(versions["1"], 2)[1], rtol=1e-6)
 
 
@@ -251,9 +211,9 @@ def test_our_clients_go_on_with_their_version_and_learn_when_it_is_gone(
 
 
 @pytest.fixture
-def limited(server: Server, versions: dict[str, Policy], box_policy: Callable[..., Path], tmp_path: Path) -> Server:
+def limited(server: Server, versions: dict[str, Policy], tmp_path: Path) -> Server:
     options = PolicyOptions(max_action_step=LIMIT)
-    folders = [box_policy(tmp_path), versions["1"].path]
+    folders = [write_box_policy(tmp_path), versions["1"].path]
     server.store = store_of(*(Policy.load(folder, options=options) for folder in folders))
     return server
 

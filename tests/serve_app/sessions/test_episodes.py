@@ -2,35 +2,30 @@
 
 from __future__ import annotations
 
-import functools
-import http.client
-import json
 import random
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
-import websockets.sync.client
 from websockets.exceptions import ConnectionClosed
 
+from bundles import write_box_policy, write_leaky_policy
 from rlservo.bundle.nested import action_leaves
 from rlservo.bundle.spaces import leaf_specs
 from rlservo.client.stream_client import StreamClient
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
-from servers import exchange
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import exchange, over_uvicorn
 from stores import control_of, load_store, store_of
+from streams import Stream
 
 STEPS = 12
 Ask = Callable[..., tuple[int, Any]]
-Serve = Callable[[Any], AbstractContextManager[int]]
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +34,8 @@ def store(recurrent: Path, ur5: Path) -> PolicyStore:
 
 
 @pytest.fixture(scope="module")
-def port(store: PolicyStore, served: Serve) -> Iterator[int]:
-    with served(create_app(control_of(store), ServerSettings(session_idle_s=2.0))) as port:
+def port(store: PolicyStore) -> Iterator[int]:
+    with over_uvicorn(create_app(control_of(store), ServerSettings(session_idle_s=2.0))) as port:
         yield port
 
 
@@ -57,40 +52,6 @@ def asking(port: int) -> Ask:
 @pytest.fixture(scope="module")
 def ask(port: int) -> Ask:
     return asking(port)
-
-
-def pack_array(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
-    raise TypeError(type(value))
-
-
-def unpack_array(value: Any) -> Any:
-    if b"__ndarray__" in value:
-        return np.frombuffer(value[b"data"], value[b"dtype"]).reshape(value[b"shape"])
-    return value
-
-
-pack = functools.partial(msgpack.packb, default=pack_array)
-unpack = functools.partial(msgpack.unpackb, object_hook=unpack_array)
-
-
-class Socket:
-    def __init__(self, port: int, path: str) -> None:
-        self._open = websockets.sync.client.connect(f"ws://127.0.0.1:{port}{path}", compression=None)
-        self._socket = self._open.__enter__()
-        self.metadata = unpack(self._socket.recv())
-
-    def ask(self, **request: Any) -> Any:
-        self._socket.send(pack(request))
-        reply = self._socket.recv()
-        return json.loads(reply) if isinstance(reply, str) else unpack(reply)
-
-    def __enter__(self) -> Socket:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._open.__exit__(None, None, None)
 
 
 def plain(value: Any) -> Any:
@@ -236,10 +197,10 @@ def test_an_idle_session_is_evicted_and_its_client_learns_of_it(ask: Ask) -> Non
     assert session(ask, first, reset=True)[1]["action"] == begun
 
 
-def test_sessions_are_bounded_in_number(store: PolicyStore, served: Serve) -> None:
+def test_sessions_are_bounded_in_number(store: PolicyStore) -> None:
     (obs,) = observations("lstm_box", 1)
     body = {"obs": plain(obs), "reset": True}
-    with served(create_app(control_of(store), ServerSettings(max_sessions=8))) as port:
+    with over_uvicorn(create_app(control_of(store), ServerSettings(max_sessions=8))) as port:
         ask = asking(port)
         statuses = [ask("/v1/policies/lstm_box/act", {**body, "session_id": f"many-{n}"})[0] for n in range(9)]
         assert statuses == [200] * 8 + [503]
@@ -273,14 +234,14 @@ def test_a_refused_request_leaves_the_memory_where_it_was(ask: Ask, recurrent: P
         assert session(ask, obs, explore=True, seed=-1)[0] == 400
 
 
-def test_a_session_stays_with_its_version_until_that_is_gone(
-    served: Serve, leaky_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    one, two = (Policy.load(leaky_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12"))
+def test_a_session_stays_with_its_version_until_that_is_gone(tmp_path: Path) -> None:
+    one, two = (
+        Policy.load(write_leaky_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12")
+    )
     stores = [store_of(one), store_of(one, two), store_of(two)]
     now = 0
     obs = [0.5, -0.25, 1.0]
-    with served(create_app(control_of(lambda: stores[now]), ServerSettings())) as port:
+    with over_uvicorn(create_app(control_of(lambda: stores[now]), ServerSettings())) as port:
         ask = asking(port)
 
         def step(**more: Any) -> tuple[int, Any]:
@@ -298,15 +259,15 @@ def test_a_session_stays_with_its_version_until_that_is_gone(
         assert step(reset=True)[1]["version"] == "2"
 
 
-def test_an_open_stream_without_a_memory_follows_the_default(
-    served: Serve, box_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    one, two = (Policy.load(box_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12"))
+def test_an_open_stream_without_a_memory_follows_the_default(tmp_path: Path) -> None:
+    one, two = (
+        Policy.load(write_box_policy(tmp_path, version=version, seed=seed)) for seed, version in enumerate("12")
+    )
     stores = [store_of(one), store_of(one, two)]
     now = 0
     obs = np.linspace(-1, 1, 27)
     with (
-        served(create_app(control_of(lambda: stores[now]), ServerSettings())) as port,
+        over_uvicorn(create_app(control_of(lambda: stores[now]), ServerSettings())) as port,
         StreamClient(f"http://127.0.0.1:{port}", "ur5", deadline_ms=5000) as client,
     ):
         assert client.act(obs) == pytest.approx(one.act(obs))
@@ -316,15 +277,15 @@ def test_an_open_stream_without_a_memory_follows_the_default(
 
 
 def test_a_stream_begins_its_next_episode_with_the_bundle_that_is_there_now(
-    store: PolicyStore, recurrent: Path, served: Serve
+    store: PolicyStore, recurrent: Path
 ) -> None:
     again = Policy.load(recurrent / "lstm_box")
     stores = [store, store_of(again)]
     now = 0
     obs = observations("lstm_box", 1)[0]
     with (
-        served(create_app(control_of(lambda: stores[now]), ServerSettings())) as port,
-        Socket(port, "/v1/policies/lstm_box/stream?errors=keep") as stream,
+        over_uvicorn(create_app(control_of(lambda: stores[now]), ServerSettings())) as port,
+        Stream(port, "/v1/policies/lstm_box/stream?errors=keep") as stream,
     ):
         assert stream.ask(obs=obs)["session_step"] == 1
         now = 1  # the same version, loaded again
@@ -417,15 +378,12 @@ def test_sequences_of_the_open_inference_protocol_are_sessions(
 
 
 def test_the_models_metadata_lists_states_and_leaves(port: int) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("GET", "/v2/models/act_nested")
-    model = json.loads(connection.getresponse().read())
+    model = exchange(port, "GET", "/v2/models/act_nested").document
     assert {"name": "obs.arm.mode", "datatype": "INT64", "shape": [-1]} in model["inputs"]
     assert {"name": "state_in.h", "datatype": "FP32", "shape": [-1, 1, 8]} in model["inputs"]
     assert [one["name"] for one in model["outputs"]] == [
         "action.a.0", "action.a.1", "action.b", "state_out.c", "state_out.h"
     ]  # fmt: skip
-    connection.close()
 
 
 @pytest.mark.parametrize(
@@ -463,7 +421,7 @@ def test_a_wrong_nested_request_is_told_what_is_wrong(
 def test_a_stream_remembers_its_episode_until_reset(port: int, store: PolicyStore, recurrent: Path, name: str) -> None:
     seen = observations(name)
     expected = in_process(recurrent, name, seen)
-    with Socket(port, f"/v1/policies/{name}/stream") as one, Socket(port, f"/v1/policies/{name}/stream") as other:
+    with Stream(port, f"/v1/policies/{name}/stream") as one, Stream(port, f"/v1/policies/{name}/stream") as other:
         for episode in range(2):
             for step, (obs, action) in enumerate(zip(seen, expected, strict=True)):
                 reward = {"reward": reward_of(step, obs)} if name == "lstm_previous" else {}
@@ -484,7 +442,7 @@ def first_of(chunk: Any) -> Any:
 def test_a_flag_in_an_openpi_clients_observation_map_resets(port: int, store: PolicyStore, recurrent: Path) -> None:
     seen = observations("act_nested", 2)
     expected = in_process(recurrent, "act_nested", seen)
-    with Socket(port, "/v1/policies/act_nested/stream") as stream:
+    with Stream(port, "/v1/policies/act_nested/stream") as stream:
         for _ in range(2):
             same(store, "act_nested", first_of(stream.ask(**seen[0], reset=True)["actions"]), expected[0])
             same(store, "act_nested", first_of(stream.ask(**seen[1])["actions"]), expected[1])
@@ -494,7 +452,7 @@ def test_a_stream_may_carry_its_state_itself(port: int, store: PolicyStore, recu
     seen = observations("lstm_box", rows=2)
     state: Any = {}
     for obs, action in zip(seen, in_process(recurrent, "lstm_box", seen), strict=True):
-        with Socket(port, "/v1/policies/lstm_box/stream") as stream:  # another connection for every step
+        with Stream(port, "/v1/policies/lstm_box/stream") as stream:  # another connection for every step
             reply = stream.ask(obs=obs, state=state)
             np.testing.assert_allclose(reply["actions"][:, 0], action, rtol=1e-5, atol=1e-6)
             state = reply["state"]
@@ -503,7 +461,7 @@ def test_a_stream_may_carry_its_state_itself(port: int, store: PolicyStore, recu
 def test_a_stream_that_keeps_errors_goes_on_after_one(port: int, recurrent: Path) -> None:
     seen = observations("lstm_box", 3)
     expected = in_process(recurrent, "lstm_box", seen)
-    with Socket(port, "/v1/policies/lstm_box/stream?errors=keep") as stream:
+    with Stream(port, "/v1/policies/lstm_box/stream?errors=keep") as stream:
         for step, obs in enumerate(seen):
             wrong = stream.ask(obs=obs[:2], seq=100 + step)
             assert (wrong["code"], wrong["seq"]) == ("bad-observation", 100 + step)
@@ -512,7 +470,7 @@ def test_a_stream_that_keeps_errors_goes_on_after_one(port: int, recurrent: Path
             reply = stream.ask(obs=obs, seq=step)
             assert reply["seq"] == step
             np.testing.assert_allclose(reply["actions"][0], expected[step], rtol=1e-5, atol=1e-6)
-    with Socket(port, "/v1/policies/lstm_box/stream") as stream:
+    with Stream(port, "/v1/policies/lstm_box/stream") as stream:
         stream.ask(obs=seen[0][:2])
         with pytest.raises(ConnectionClosed):
             stream.ask(obs=seen[0])
@@ -524,7 +482,7 @@ def test_timestamps_are_echoed_over_every_protocol(port: int, ask: Ask) -> None:
     _, plainly = ask("/v1/policies/ur5/act", {"obs": obs.tolist(), "timestamp": 12.5, "seq": 1})
     inputs = [{"name": "obs", "shape": [1, 27], "datatype": "FP32", "data": obs.tolist()}]
     _, inferred = ask("/v2/models/ur5/infer", {"inputs": inputs, "parameters": {"timestamp": 12.5, "seq": 1}})
-    with Socket(port, "/v1/policies/ur5/stream") as stream:
+    with Stream(port, "/v1/policies/ur5/stream") as stream:
         streamed = stream.ask(obs=obs, timestamp=12.5, seq=1)
     for reply in (plainly, inferred["parameters"], streamed):
         assert (reply["timestamp"], reply["seq"]) == (12.5, 1)

@@ -12,18 +12,19 @@ import json
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from bundles import write_leaky_policy
 from rlservo.bundle.bundle import read_contract
 from rlservo.client.client_episode import ClientEpisode
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
+from servers import over_uvicorn
 from storages import closing_sessions
 from stores import control_of, load_store
 
@@ -56,20 +57,18 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def bundle(leaky_policy: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return leaky_policy(tmp_path_factory.mktemp("leaky"))
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_leaky_policy(tmp_path_factory.mktemp("leaky"))
 
 
 @pytest.fixture
-def server(
-    bundle: Path, served: Callable[[Any], AbstractContextManager[int]], request: pytest.FixtureRequest
-) -> Iterator[Server]:
+def server(bundle: Path, request: pytest.FixtureRequest) -> Iterator[Server]:
     settings = ServerSettings()
     if getattr(request, "param", "memory") == "redis":
         settings = ServerSettings(session_store=request.getfixturevalue("redis_server").url)
     store = load_store(bundle)
     server = Server(create_app(control_of(store), settings))
-    with served(server) as server.port:
+    with over_uvicorn(server) as server.port:
         yield server
 
 

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import httpx
 import numpy as np
 import pytest
 
+from bundles import write_leaky_policy
 from rlservo.bundle.nested import action_leaves
 from rlservo.client.policy_client import PolicyClient
 from rlservo.errors import UsageError
@@ -26,11 +26,11 @@ from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.request_handler import RequestHandler
 from rlservo.serve_app.server.settings import ServerSettings
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import over_uvicorn
 from storages import RedisServer, closing_sessions
 from stores import control_of, load_store, store_of
 
-Serve = Callable[[Any], AbstractContextManager[int]]
 SEEN = [np.random.default_rng(seed).uniform(-1, 1, 3).astype(np.float32) for seed in range(12)]
 
 
@@ -73,21 +73,19 @@ def store(recurrent: Path, ur5: Path) -> PolicyStore:
 
 
 @contextlib.contextmanager
-def serving(
-    served: Serve, redis: RedisServer, *providers: Callable[[], PolicyStore], **settings: Any
-) -> Iterator[Servers]:
+def serving(redis: RedisServer, *providers: Callable[[], PolicyStore], **settings: Any) -> Iterator[Servers]:
     """Serve what each provider gives, by a server of its own."""
     chosen = ServerSettings(session_store=redis.url, **settings)
     with contextlib.ExitStack() as stack:
         apps = [create_app(control_of(provider), chosen, is_alone=False) for provider in providers]
-        servers = Servers(*(stack.enter_context(served(closing_sessions(app))) for app in apps))
+        servers = Servers(*(stack.enter_context(over_uvicorn(closing_sessions(app))) for app in apps))
         stack.callback(servers.close)
         yield servers
 
 
 @pytest.fixture
-def servers(store: PolicyStore, served: Serve, redis_server: RedisServer) -> Iterator[Servers]:
-    with serving(served, redis_server, lambda: store, lambda: store) as servers:
+def servers(store: PolicyStore, redis_server: RedisServer) -> Iterator[Servers]:
+    with serving(redis_server, lambda: store, lambda: store) as servers:
         yield servers
 
 
@@ -126,14 +124,14 @@ def test_sequences_of_the_open_inference_protocol_reach_two_servers(servers: Ser
 
 
 def test_nested_actions_rewards_and_a_limit_on_the_step_are_kept(
-    served: Serve, redis_server: RedisServer, recurrent: Path, leaky_policy: Callable[..., Path], tmp_path: Path
+    redis_server: RedisServer, recurrent: Path, tmp_path: Path
 ) -> None:
     options = {"leaky": PolicyOptions(max_action_step=0.1)}
-    store = load_store(recurrent, leaky_policy(tmp_path), options=options)
+    store = load_store(recurrent, write_leaky_policy(tmp_path), options=options)
     nested = {
         "zeta": [0.5, -1.0], "arm": {"mode": 1, "flags": [1, 0, 1, 0]}, "grid": [[1, 0], [[3, 4], [0, 9]]],
     }  # fmt: skip
-    with serving(served, redis_server, lambda: store, lambda: store) as servers:
+    with serving(redis_server, lambda: store, lambda: store) as servers:
         for name in ("act_nested", "lstm_previous", "leaky"):
             policy = store.get(name).clone()
             for step in range(6):
@@ -168,10 +166,10 @@ def test_a_request_sent_again_to_another_server_gets_the_same_action_and_moves_n
 
 
 def test_steps_of_one_session_that_come_at_once_are_computed_one_after_the_other(
-    store: PolicyStore, served: Serve, redis_server: RedisServer, recurrent: Path
+    store: PolicyStore, redis_server: RedisServer, recurrent: Path
 ) -> None:
     with (
-        serving(served, redis_server, lambda: store, lambda: store, max_queue_ms=60_000) as servers,
+        serving(redis_server, lambda: store, lambda: store, max_queue_ms=60_000) as servers,
         ThreadPoolExecutor(16) as pool,
     ):
         servers.act(SEEN[0], reset=True)
@@ -229,7 +227,7 @@ def test_without_redis_sessions_are_503_and_work_again_when_it_is_back(
     assert sum("cannot be used" in line for line in said) == sum("again" in line for line in said) == 2  # each server
 
 
-def test_a_proxy_without_a_redis_behind_it_is_503(store: PolicyStore, served: Serve) -> None:
+def test_a_proxy_without_a_redis_behind_it_is_503(store: PolicyStore) -> None:
     def reset_connections() -> None:
         with contextlib.suppress(OSError):  # closed
             while True:
@@ -241,7 +239,7 @@ def test_a_proxy_without_a_redis_behind_it_is_503(store: PolicyStore, served: Se
         pool.submit(reset_connections)
         settings = ServerSettings(session_store=f"redis://127.0.0.1:{listener.getsockname()[1]}/0")
         try:
-            with served(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as port:
+            with over_uvicorn(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as port:
 
                 def ask(_: int) -> tuple[int, str]:
                     with contextlib.closing(Servers(port)) as server:
@@ -265,7 +263,7 @@ def test_a_full_redis_refuses_a_step_and_leaves_the_memory_where_it_was(
 
 
 def test_a_server_that_stood_still_between_reading_and_writing_writes_nothing_over_a_newer_memory(
-    store: PolicyStore, served: Serve, redis_server: RedisServer, recurrent: Path, monkeypatch: pytest.MonkeyPatch
+    store: PolicyStore, redis_server: RedisServer, recurrent: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held, go_on = threading.Event(), threading.Event()
     its_store = load_store(recurrent)
@@ -278,8 +276,8 @@ def test_a_server_that_stood_still_between_reading_and_writing_writes_nothing_ov
         return compute(*arguments, **more)
 
     with (
-        serving(served, redis_server, lambda: its_store) as one,
-        serving(served, redis_server, lambda: store) as other,
+        serving(redis_server, lambda: its_store) as one,
+        serving(redis_server, lambda: store) as other,
         Policy.load(recurrent / "lstm_box") as policy,
         ThreadPoolExecutor(1) as pool,
     ):
@@ -295,10 +293,8 @@ def test_a_server_that_stood_still_between_reading_and_writing_writes_nothing_ov
         same(other.act(SEEN[3], seq=3)[1]["action"], policy.act(SEEN[3]))
 
 
-def test_a_session_without_a_step_is_forgotten_by_redis(
-    store: PolicyStore, served: Serve, redis_server: RedisServer
-) -> None:
-    with serving(served, redis_server, lambda: store, session_idle_s=0.5) as servers:
+def test_a_session_without_a_step_is_forgotten_by_redis(store: PolicyStore, redis_server: RedisServer) -> None:
+    with serving(redis_server, lambda: store, session_idle_s=0.5) as servers:
         assert servers.act(SEEN[0], reset=True)[0] == 200
         for _ in range(4):
             time.sleep(0.2)
@@ -308,14 +304,12 @@ def test_a_session_without_a_step_is_forgotten_by_redis(
         assert redis_server.command("DBSIZE") == b"0\n"
 
 
-def test_a_session_stays_with_its_version_on_every_server(
-    served: Serve, redis_server: RedisServer, leaky_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    folders = [leaky_policy(tmp_path, version=version, seed=seed) for seed, version in enumerate("12")]
+def test_a_session_stays_with_its_version_on_every_server(redis_server: RedisServer, tmp_path: Path) -> None:
+    folders = [write_leaky_policy(tmp_path, version=version, seed=seed) for seed, version in enumerate("12")]
     both = [store_of(*map(Policy.load, folders)) for _ in range(2)]  # as two processes load them
     only_new = store_of(Policy.load(folders[1]))
     now: list[PolicyStore] = [store_of(Policy.load(folders[0]))] * 2
-    with serving(served, redis_server, lambda: now[0], lambda: now[1]) as servers:
+    with serving(redis_server, lambda: now[0], lambda: now[1]) as servers:
         assert servers.act(SEEN[0], policy="leaky", reset=True)[1]["version"] == "1"
         now[:] = both
         for _ in range(2):
@@ -327,12 +321,12 @@ def test_a_session_stays_with_its_version_on_every_server(
 
 
 def test_our_client_keeps_a_session_over_two_servers(
-    store: PolicyStore, served: Serve, redis_server: RedisServer, recurrent: Path
+    store: PolicyStore, redis_server: RedisServer, recurrent: Path
 ) -> None:
     settings = ServerSettings(session_store=redis_server.url)
     with (
-        served(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as port,
-        served(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as other,
+        over_uvicorn(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as port,
+        over_uvicorn(closing_sessions(create_app(control_of(store), settings, is_alone=False))) as other,
         PolicyClient(f"http://127.0.0.1:{port}", "lstm_box", server_state=True) as client,
         PolicyClient(f"http://127.0.0.1:{other}", "ur5", server_state=True) as stateless,
         Policy.load(recurrent / "lstm_box") as policy,
@@ -345,10 +339,8 @@ def test_our_client_keeps_a_session_over_two_servers(
                 stateless.act(np.zeros(27))
 
 
-def test_several_processes_without_a_store_refuse_sessions_and_name_the_ways_out(
-    store: PolicyStore, served: Serve
-) -> None:
-    with served(create_app(control_of(store), ServerSettings(), is_alone=False)) as port:
+def test_several_processes_without_a_store_refuse_sessions_and_name_the_ways_out(store: PolicyStore) -> None:
+    with over_uvicorn(create_app(control_of(store), ServerSettings(), is_alone=False)) as port:
         servers = Servers(port)
         for status, reply in (servers.act(SEEN[0], reset=True), servers.infer(SEEN[0], 7, sequence_start=True)):
             assert (status, reply.get("code", "bad-request")) == (400, "bad-request")

@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
-import websockets.sync.client
 from prometheus_client.parser import text_string_to_metric_families
 
-from rlservo.client.formats.msgpack_arrays import pack, unpack
+from bundles import write_leaky_policy
 from rlservo.client.policy_client import PolicyClient
 from rlservo.policy.policy import Policy
 from rlservo.serve_app.protocols.asgi_app import create_app
 from rlservo.serve_app.server.settings import ServerSettings
 from rlservo.serve_app.sessions.memory_sessions import MemorySessions
-from rlservo.serve_app.versions.loaded_versions import PolicyStore
+from rlservo.serve_app.versions.policy_store import PolicyStore
+from servers import over_uvicorn
 from stores import control_of, load_store
+from streams import Stream
+from waiting import wait_for
 
 OBS = [0.5, -0.25, 1.0]
 MOST = 8
+STREAM = "/v1/policies/leaky/stream?errors=keep"
 
 
 class Server:
@@ -57,23 +59,20 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def store(leaky_policy: Callable[..., Path], ur5: Path, tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
-    return load_store(leaky_policy(tmp_path_factory.mktemp("leaky")), ur5)
-
-
-Serve = Callable[[Any], AbstractContextManager[int]]
+def store(ur5: Path, tmp_path_factory: pytest.TempPathFactory) -> PolicyStore:
+    return load_store(write_leaky_policy(tmp_path_factory.mktemp("leaky")), ur5)
 
 
 @contextlib.contextmanager
-def serving(store: PolicyStore, served: Serve, *, idle_s: float) -> Iterator[Server]:
+def serving(store: PolicyStore, *, idle_s: float) -> Iterator[Server]:
     app = create_app(control_of(store), ServerSettings(max_sessions=MOST, session_idle_s=idle_s), replica="r")
-    with served(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+    with over_uvicorn(app) as port, httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
         yield Server(port, app, client)
 
 
 @pytest.fixture
-def server(store: PolicyStore, served: Serve) -> Iterator[Server]:
-    with serving(store, served, idle_s=60) as server:
+def server(store: PolicyStore) -> Iterator[Server]:
+    with serving(store, idle_s=60) as server:
         yield server
 
 
@@ -91,19 +90,13 @@ def test_a_batch_takes_the_places_of_its_episodes(server: Server) -> None:
 
 
 def test_a_stream_takes_places_too_and_gives_them_back(server: Server) -> None:
-    address = f"ws://127.0.0.1:{server.port}/v1/policies/leaky/stream?errors=keep"
-    with websockets.sync.client.connect(address) as socket:
-        socket.recv()
-        socket.send(pack({"obs": np.float32([OBS] * 8)}))
-        assert unpack(socket.recv())["session_step"] == 1
+    with Stream(server.port, STREAM) as stream:
+        assert stream.ask(obs=np.float32([OBS] * 8))["session_step"] == 1
         assert server.act("s", reset=True)[0] == 503
-        socket.send(pack({"obs": np.float32([OBS] * 9), "reset": True}))
-        assert "has no room for another episode" in socket.recv()
-        socket.send(pack({"obs": np.float32([OBS] * 8)}))
-        assert unpack(socket.recv())["session_step"] == 2  # what was refused has not ended the episode
-    deadline = time.monotonic() + 5
-    while server.act("s", reset=True)[0] != 200:
-        assert time.monotonic() < deadline
+        assert "has no room for another episode" in stream.ask(obs=np.float32([OBS] * 9), reset=True)["error"]
+        reply = stream.ask(obs=np.float32([OBS] * 8))
+        assert reply["session_step"] == 2  # what was refused has not ended the episode
+    wait_for(lambda: server.act("s", reset=True)[0] == 200)
     assert server.sessions.rows == 1
 
 
@@ -122,14 +115,10 @@ def test_a_reset_that_is_refused_leaves_the_episode_as_it_was(
 def test_a_stream_whose_reset_is_refused_goes_on(server: Server, store: PolicyStore) -> None:
     here = store.get("leaky").clone()
     expected = [here.act(OBS).tolist() for _ in range(2)]
-    with websockets.sync.client.connect(f"ws://127.0.0.1:{server.port}/v1/policies/leaky/stream?errors=keep") as socket:
-        socket.recv()
-        replies = []
-        for request in ({"obs": np.float32(OBS)}, {"obs": [1.0], "reset": True}, {"obs": np.float32(OBS)}):
-            socket.send(pack(request))
-            replies.append(socket.recv())
-    assert "bad-observation" in replies[1]
-    np.testing.assert_allclose([unpack(replies[0])["actions"][0], unpack(replies[2])["actions"][0]], expected)
+    with Stream(server.port, STREAM) as stream:
+        first = stream.ask(obs=np.float32(OBS))
+        assert stream.ask(obs=[1.0], reset=True)["code"] == "bad-observation"
+        np.testing.assert_allclose([first["actions"][0], stream.ask(obs=np.float32(OBS))["actions"][0]], expected)
 
 
 def test_the_id_of_a_policy_that_remembers_nothing_is_a_label(server: Server) -> None:
@@ -142,8 +131,8 @@ def test_the_id_of_a_policy_that_remembers_nothing_is_a_label(server: Server) ->
             client.act(np.zeros(27))
 
 
-def test_idle_sessions_are_forgotten_without_anybody_asking(store: PolicyStore, served: Serve) -> None:
-    with serving(store, served, idle_s=0.3) as server:
+def test_idle_sessions_are_forgotten_without_anybody_asking(store: PolicyStore) -> None:
+    with serving(store, idle_s=0.3) as server:
         assert server.act("s", reset=True)[0] == 200
         time.sleep(0.4)
         now = server.metrics()
@@ -187,11 +176,9 @@ def test_sessions_are_on_metrics(server: Server) -> None:
     assert now["rlservo_sessions_begun_total", "leaky"] == 2 and now["rlservo_sessions_lost_total", "leaky"] == 1
 
 
-def test_a_policy_alone_keeps_its_identity_wherever_it_is_loaded(
-    leaky_policy: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_policy_alone_keeps_its_identity_wherever_it_is_loaded(tmp_path: Path) -> None:
     one, same, other = (
-        Policy.load(leaky_policy(tmp_path / str(number), seed=seed)) for number, seed in enumerate((1, 1, 2))
+        Policy.load(write_leaky_policy(tmp_path / str(number), seed=seed)) for number, seed in enumerate((1, 1, 2))
     )
     assert one.identity == same.identity == one.clone().identity != other.identity
     assert one.identity.startswith("leaky/1#")

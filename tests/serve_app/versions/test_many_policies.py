@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from bundles import write_discrete_policy
 from rlservo.bundle.bundle import read_contract
 from rlservo.serve_app.repository import repository
 from stores import load_store
 
 
-def test_each_contract_is_read_by_one_look(
-    discrete_policy: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_contract_is_read_by_one_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     count = 12
     for number in range(count):
-        discrete_policy(tmp_path, name=f"grid-{number}")
+        write_discrete_policy(tmp_path, name=f"grid-{number}")
     reads = 0
 
     def counted(*given: object) -> object:
@@ -31,10 +29,10 @@ def test_each_contract_is_read_by_one_look(
     store.close()
 
 
-def test_bundle_that_has_moved_since_the_look_is_found(discrete_policy: Callable[..., Path], tmp_path: Path) -> None:
+def test_bundle_that_has_moved_since_the_look_is_found(tmp_path: Path) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
-    discrete_policy(here, name="grid")
-    discrete_policy(there, name="other")
+    write_discrete_policy(here, name="grid")
+    write_discrete_policy(there, name="other")
     places = repository.Repository([here, there])
     digest = places.look().available(needs_all=True)["grid"]["1"]
     (here / "grid").rename(there / "grid")

@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bundles import write_box_policy, write_discrete_policy
 from rlservo.errors import (
     BundleError,
     ConflictError,
@@ -239,10 +239,8 @@ def test_a_version_that_fails_is_refused_before_anything_is_written(folder: Path
     asyncio.run(run())
 
 
-def test_golden_vectors_that_are_not_reproduced_refuse_a_version(
-    folder: Path, box_policy: Callable[..., Path], tmp_path: Path
-) -> None:
-    other = box_policy(tmp_path / "other", version="11", seed=5)
+def test_golden_vectors_that_are_not_reproduced_refuse_a_version(folder: Path, tmp_path: Path) -> None:
+    other = write_box_policy(tmp_path / "other", version="11", seed=5)
     target = Path(shutil.copytree(folder / "ur5" / "10", folder / "ur5" / "11"))
     shutil.copy(other / "contract.json", target)
     for name in ("policy.onnx", "SHA256SUMS"):
@@ -286,12 +284,10 @@ def test_a_configuration_begins_a_plan_and_commands_rule_after(
     asyncio.run(run())
 
 
-def test_a_version_exported_since_is_not_in_use_by_itself_and_a_start_says_so(
-    folder: Path, box_policy: Callable[..., Path]
-) -> None:
+def test_a_version_exported_since_is_not_in_use_by_itself_and_a_start_says_so(folder: Path) -> None:
     async def run() -> None:
         await Fleet(folder, folder).deploy({})
-        box_policy(folder, version="11", seed=11)
+        write_box_policy(folder, version="11", seed=11)
         fleet = Fleet(folder, folder)
         await fleet.deploy({})
         said = await fleet.controls[0].look()
@@ -328,9 +324,7 @@ def test_a_process_that_cannot_follow_keeps_what_it_had_and_tells_why(
     asyncio.run(run())
 
 
-def test_the_same_version_is_the_same_bundle_in_every_process(
-    folder: Path, box_policy: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_same_version_is_the_same_bundle_in_every_process(folder: Path, tmp_path: Path) -> None:
     async def run() -> None:
         fleet = Fleet(folder, folder)
         document = config("1", "2", production="1")
@@ -339,7 +333,7 @@ def test_the_same_version_is_the_same_bundle_in_every_process(
         assert store is not None
         action = store.get("ur5", "2").act(OBS)
         shutil.rmtree(folder / "ur5" / "2")
-        shutil.move(box_policy(tmp_path / "again", version="2", seed=9), folder / "ur5" / "2")
+        shutil.move(write_box_policy(tmp_path / "again", version="2", seed=9), folder / "ur5" / "2")
         restarted = fleet.start(folder, "restarted")  # its default is there; the exchanged version is not served
         await restarted.configure(document)
         assert restarted.store is not None and restarted.store.versions("ur5") == ("1",)
@@ -364,10 +358,8 @@ def test_a_process_whose_default_is_gone_does_not_start(folder: Path) -> None:
     asyncio.run(run())
 
 
-def test_canary_and_shadow_have_to_read_and_give_the_same(
-    folder: Path, discrete_policy: Callable[..., Path], rewrite_contract: Callable[..., None]
-) -> None:
-    discrete_policy(folder, name="ur5", version="12")
+def test_canary_and_shadow_have_to_read_and_give_the_same(folder: Path) -> None:
+    write_discrete_policy(folder, name="ur5", version="12")
 
     async def run() -> None:
         fleet = Fleet(folder, folder)
@@ -488,6 +480,29 @@ def test_a_plan_that_is_no_plan_stops_nobody_and_a_lost_one_is_not_begun_again(
     asyncio.run(run())
 
 
+def test_a_process_in_place_of_another_begins_no_plan_for_a_lost_one(folder: Path, tmp_path: Path) -> None:
+    async def run() -> None:
+        plans, server, next_server = (tmp_path / name for name in ("plans", "server", "next server"))
+        for each in (plans, server, next_server):
+            each.mkdir()
+        fleet = Fleet(plans, folder)
+        (first,) = fleet.controls
+        await first.configure(config("1", production="1"), server)
+        shutil.move(plans / FOLDER, tmp_path / "away")
+        replacement = fleet.start(folder, "replacement")
+        for control, given in ((replacement, server), (first, None)):  # the second: `serve deploy` with another one
+            with pytest.raises(UnavailableError, match="has lost the plan that this server follows: restore it"):
+                await control.configure(config("1", "2", production="2"), given)
+        assert not (plans / FOLDER).exists()
+        shutil.move(tmp_path / "away", plans / FOLDER)
+        await replacement.configure({}, server)
+        assert replacement.store is not None and replacement.store.default("ur5") == "1"
+        shutil.rmtree(plans / FOLDER)
+        await fleet.start(folder, "of the next server").configure(config("2", production="2"), next_server)
+
+    asyncio.run(run())
+
+
 STRANGE = {
     "000000002.json": "000000002.json holds plan 1, so it is a copy",
     "000000007.json": "000000007.json does not follow plan 1",
@@ -560,6 +575,8 @@ def test_the_plan_stands_in_the_first_place_that_can_be_written_or_in_the_users_
     assert PlanFiles([folder], root=str(other)).place == f"{other}/{FOLDER}"
     kept = PlanFiles([bundle, "https://host/policies"]).place
     assert kept.startswith(f"{tmp_path}/state/rlservo/plans/") and kept != PlanFiles([bundle]).place
+    (tmp_path / "notes.csv").touch()  # given by mistake: its own sentence is the look's
+    assert PlanFiles([tmp_path / "notes.csv"]).place.startswith(f"{tmp_path}/state/")
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
     assert PlanFiles([folder]).place.startswith(f"{tmp_path}/state/")
     (folder / FOLDER).mkdir()  # the operator's, who may write there

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bundles import write_box_policy
 from rlservo.errors import (
     BundleError,
     ConflictError,
@@ -17,7 +17,7 @@ from rlservo.errors import (
     UsageError,
 )
 from rlservo.policy.policy import Policy
-from rlservo.serve_app.versions.loaded_versions import take_step
+from rlservo.serve_app.versions.policy_store import take_step
 from stores import load_store
 
 OBS = np.zeros(27, np.float32) + 0.1
@@ -50,18 +50,18 @@ def test_unknown_names_and_versions_say_what_there_is(policies: Path) -> None:
 
 
 def test_two_bundles_of_the_same_name_and_version_are_refused_and_a_copy_counts_once(
-    policies: Path, box_policy: Callable[..., Path], tmp_path: Path
+    policies: Path, tmp_path: Path
 ) -> None:
     copy = Path(shutil.copytree(policies / "ur5" / "1", tmp_path / "elsewhere"))
     assert load_store(policies / "ur5" / "1", copy).versions("ur5") == ("1",)
-    other = box_policy(tmp_path / "other", version="1", seed=7)
+    other = write_box_policy(tmp_path / "other", version="1", seed=7)
     with pytest.raises(UsageError, match="policy 'ur5' version 1 is in both"):
         load_store(policies / "ur5" / "1", other)
 
 
-def test_versions_that_compare_equal_are_refused(box_policy: Callable[..., Path], tmp_path: Path) -> None:
-    box_policy(tmp_path, version="1")
-    box_policy(tmp_path, version="1.0.0")
+def test_versions_that_compare_equal_are_refused(tmp_path: Path) -> None:
+    write_box_policy(tmp_path, version="1")
+    write_box_policy(tmp_path, version="1.0.0")
     with pytest.raises(ConflictError, match="policy 'ur5': two versions compare equal"):
         load_store(tmp_path)
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rlservo.robots.simulated.ur_controller.motion import Motion, MoveJ, Ramp, Servo
 from rlservo.robots.simulated.ur_controller.tool import Tool
+from rlservo.robots.ur.calibration import data_sheet, frames_of
 from rlservo.robots.ur.parameters import CB3, JOINTS, POSITION_LIMITS, rate_hz_of
 from rlservo.robots.ur.simulation import URSimulation
 
@@ -24,6 +25,15 @@ log = logging.getLogger("rlservo.ur_controller")
 
 START_JOINTS = (0.0, -2.5, 1.5, -1.5, -1.4, 0.0)  # [rad]
 LIMITS: NDArray[np.float64] = np.array(POSITION_LIMITS)
+# From the data sheet's theta, a, d and alpha, of the size that real arms have.
+DEVIATIONS: NDArray[np.float64] = np.array(
+    [
+        [0.0, 0.002, -0.003, 0.002, 0.0, 0.0],
+        [1e-4, 3e-4, 1e-3, 0.0, 0.0, 0.0],
+        [2e-4, 1e-3, -1e-3, 3e-4, 1e-4, -3e-4],
+        [-5e-4, -0.002, 0.004, -5e-4, -5e-4, 0.0],
+    ]
+)
 STOP_DECELERATION = 10.0  # [rad/s^2], of every stop that is not requested by a program
 LARGEST_ACCELERATION = 40.0  # [rad/s^2] of a setpoint; more counts as a jump and causes a protective stop
 SCALING_RATE = 5.0  # [1/s], at which a changed speed, a pause and its end take effect
@@ -83,13 +93,18 @@ class _Watchdog:
 class Controller:
     """One arm and its program. Not thread-safe: one loop calls it."""
 
-    def __init__(self, ur_model: str = "ur5e") -> None:
+    def __init__(self, ur_model: str = "ur5e", *, kinematics: Vector | None = None) -> None:
+        """Make an arm; `kinematics` are its own Denavit-Hartenberg parameters (4, 6), as in `calibration.py`."""
         self.ur_model = ur_model
         self.is_e_series = ur_model not in CB3
         self.rate_hz = rate_hz_of(ur_model)
         self.version = (5, 12, 2, 1101534) if self.is_e_series else (3, 15, 8, 106339)
         self.dt = 1.0 / self.rate_hz
         self.simulation = URSimulation(ur_model, max_velocity_scale=1.0, cycle_s=self.dt, objects=())
+        self.is_calibrated = kinematics is not None
+        self.kinematics = data_sheet(ur_model) if kinematics is None else kinematics
+        if self.is_calibrated:
+            self.simulation.calibrate(frames_of(self.kinematics))
         self.simulation.place(START_JOINTS)
         self.inputs_int, self.inputs_double = [0] * REGISTERS, [0.0] * REGISTERS
         self.outputs_int, self.outputs_double = [0] * REGISTERS, [0.0] * REGISTERS

@@ -22,6 +22,7 @@ import numpy as np
 from rlservo.robots.simulated.ur_controller import dashboard
 from rlservo.robots.simulated.ur_controller.control_script import load_program
 from rlservo.robots.simulated.ur_controller.controller import Controller
+from rlservo.robots.simulated.ur_controller.primary import kinematics_package
 from rlservo.robots.simulated.ur_controller.rtde import RtdeSession
 
 DASHBOARD, PRIMARY, SECONDARY, REAL_TIME, RTDE = 29999, 30001, 30002, 30003, 30004
@@ -145,6 +146,8 @@ class ControllerServer:
         self._connections[opened] = connection
         if connection.port == DASHBOARD:
             self._send(connection, f"{dashboard.GREETING}\n".encode())
+        if connection.port == PRIMARY:
+            self._send(connection, kinematics_package(self.controller))
 
     def _read(self, connection: _Connection) -> None:
         try:

@@ -1,4 +1,4 @@
-"""Routing table of the application: method, path and access of every route."""
+"""Routing: a route, and the table that finds one by method and path. Each protocol lists its own routes."""
 
 from __future__ import annotations
 

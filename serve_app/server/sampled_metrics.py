@@ -1,4 +1,4 @@
-"""Metrics of a server as Prometheus reads them: what the request handler holds, sampled when they are asked for."""
+"""Counters and gauges of a server, sampled from the request handler at scrape time; histograms: `metrics.py`."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from cockpits import Cockpit, cockpit_of
 from rlservo.deploy.cockpit.drive import Drive
-from rlservo.deploy.cockpit.inputs import number_of, point_of
+from rlservo.deploy.cockpit.message_checks import number_of, point_of
 from rlservo.deploy.cockpit.panel import DrivePanel
 from rlservo.deploy.cockpit.playback import PlaybackPanel, Tape
 from rlservo.deploy.cockpit.policies import BundledPolicies, Choice
