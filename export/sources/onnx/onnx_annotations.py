@@ -14,6 +14,7 @@ They may only add to each other: where two differ by more than such rounding, th
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -124,7 +125,7 @@ def read_annotations(
         elif file.name == "deploy.yaml":
             found.append((str(file), partial(_deploy, file, size, joint_order)))
         elif (manifest := _json(file)).get("format") == "policy_package":
-            found.append((str(file), partial(_policy_package, file, manifest)))
+            found.append((str(file), partial(_policy_package, file, manifest, model)))
         elif manifest.keys() & {"obs_len", "action_len", "policies", "schema_version"}:
             found.append((str(file), partial(_microduck, file, manifest, model)))
     if metadata.keys() & {"joint_names", "observation_names", "action_scale"}:
@@ -385,8 +386,9 @@ def _deploy(file: Path, size: int, joint_order: Sequence[str]) -> Annotation:
     for name, term in described["actions"].items():
         joints = selected(joint_order, term.get("joint_ids")) if joint_order else []
         actions.append((name, joints, len(term["scale"]), term))
-        offset = term.get("offset")
-        if isinstance(offset, list) and offset != default and sorted(offset) == sorted(default):
+        offset, ids = term.get("offset"), term.get("joint_ids")
+        own = selected(default, ids) if isinstance(ids, list) else default
+        if isinstance(offset, list) and offset != own and sorted(offset) == sorted(default):
             raise CheckpointError(
                 f"{file}: default_joint_pos is {default}, but the offset of {name} has the same numbers as {offset}: "
                 "they are in different joint orders"
@@ -440,9 +442,12 @@ def read_facts(model: Path) -> CheckpointFacts:
     )
 
 
-def _policy_package(file: Path, manifest: Mapping[str, Any]) -> Annotation:
+def _policy_package(file: Path, manifest: Mapping[str, Any], path: Path) -> Annotation:
     """physicalai/inference/manifest.py, also LeRobot's: the processors around the model are not in the graph."""
     model = manifest.get("model") or {}
+    files = [str(name) for name in (model.get("artifacts") or {}).values()]
+    if files and path.name not in map(os.path.basename, files):
+        raise CheckpointError(f"{file}: its model is {', '.join(files)}, the given file is {path.name}")
     runner = model.get("runner") or {}
     kind = str(runner.get("type") or runner.get("class_path") or "single_pass")
     around = [*(model.get("preprocessors") or ()), *(model.get("postprocessors") or ())]

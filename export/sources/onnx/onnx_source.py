@@ -149,6 +149,12 @@ def _check_sizes(
     sizes = [("action", said.action_size, action), ("observation", said.observation_size, main)]
     if main is not None and said.observation_names:
         sizes.append(("list of observation names", len(said.observation_names), main))
+    least = sum((term.size or 1) * term.history for term in said.terms)
+    if main is not None and least > (own := int(np.prod(main.row))):
+        raise CheckpointError(
+            f"{said.place}: its observation terms with their histories have at least {least} elements, '{main.name}' of "
+            f"{file.name} has {own}"
+        )
     for what, size, tensor in sizes:
         if size is not None and tensor is not None and size != (own := int(np.prod(tensor.row))):
             raise CheckpointError(

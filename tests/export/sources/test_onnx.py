@@ -338,7 +338,7 @@ def test_a_term_of_another_package_or_with_a_modifier_is_only_a_name(tmp_path: P
 def test_only_the_last_of_a_history_is_what_a_robot_measures_now(tmp_path: Path) -> None:
     given = unitree(tmp_path)
     config = yaml.safe_load((tmp_path / "params" / "deploy.yaml").read_text())
-    config["actions"]["JointPositionAction"]["joint_ids"] = [2, 0, 1]
+    config["actions"]["JointPositionAction"] |= {"joint_ids": [2, 0, 1], "offset": [DEFAULT[2], DEFAULT[0], DEFAULT[1]]}
     (tmp_path / "params" / "deploy.yaml").write_text(yaml.safe_dump(config))
     result = export(given, tmp_path / "out")
     assert [name for name, *_ in elements(result, "action")] == ["elbow", "pan", "lift"]
@@ -417,7 +417,7 @@ def test_the_actions_of_a_run_are_clipped_before_they_are_scaled(origin: Origin,
 
 
 @pytest.mark.parametrize("history", [0, 3])
-def test_a_relative_action_is_added_to_the_position_that_is_observed_unless_older_ones_are(
+def test_a_relative_action_is_added_to_the_newest_position_that_is_observed(
     history: int, tmp_path: Path, notices: list[str]
 ) -> None:
     described = descriptors()
@@ -426,21 +426,19 @@ def test_a_relative_action_is_added_to_the_position_that_is_observed_unless_olde
         "clip": [[-0.02, 0.02], [-0.5, 0.5], [-0.5, 0.5]],
     }  # fmt: skip
     policy_terms = described["observations"]["policy"]
-    if history:  # of the positions, beside nothing that would not fit
-        del policy_terms[1:3]
+    if history:  # three positions of three joints and seven of the command are as many as before
+        del policy_terms[3], policy_terms[1]
         policy_terms[0]["overloads"]["history_length"] = history
-        policy_terms[1]["shape"] = [4]
     given = isaac_lab(tmp_path, actions=described["actions"], observations=described["observations"])
     result = export(given, tmp_path / "out", notices)
-    assert {element[2] for element in elements(result, "action")} == {
-        "relative joint position" if history else "joint position"
-    }
+    assert {element[2] for element in elements(result, "action")} == {"joint position"}
+    newest = slice(6, 9) if history else slice(0, 3)  # a term's history begins with the oldest
     seen, raw = episode(replace(given, scale=1.0, offset=0.0, clip=(-np.inf, np.inf)), 12)
     steps = np.clip(0.5 * np.asarray(raw), [-0.02, -0.5, -0.5], [0.02, 0.5, 0.5])
     assert (np.abs(steps[:, 0]) == 0.02).any() and (np.abs(steps[:, 1:]) < 0.5).all()
     with Policy.load(result.path) as policy:
         for obs, step in zip(seen, steps, strict=True):
-            positions = 0.0 if history else np.asarray(row(obs))[:3] + DEFAULT
+            positions = np.asarray(row(obs))[newest] + DEFAULT
             np.testing.assert_allclose(policy.act(row(obs)), step + positions, rtol=1e-5, atol=2e-6)
 
 
@@ -483,6 +481,10 @@ def test_a_manifests_facts_are_the_contracts(tmp_path: Path) -> None:
          "manifest.json: normalize is not in the graph"),
         (physicalai, {"runner": {"type": "action_chunking", "chunk_size": 100}}, UnsupportedError,
          "the runner action_chunking is not in the graph"),
+        (mjlab, {"observation_terms_history_length": "0,0,0,12,0"}, CheckpointError,
+         r"its observation terms with their histories have at least 17 elements, 'obs' of .*onnx has 14"),
+        (physicalai, {"artifacts": {"model": "other.onnx"}}, CheckpointError,
+         "its model is other.onnx, the given file is model.onnx"),
         (unitree, {"default_joint_pos": [0.0, 0.1]}, CheckpointError,
          "default_joint_pos has 2 joints, but the given joint order has 3"),
         (unitree, {"actions": {"JointPositionAction": {"scale": [1.0] * 3, "offset": DEFAULT, "clip": [-1.0, 1.0]}}},
