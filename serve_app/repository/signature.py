@@ -123,7 +123,8 @@ def check_signature(bundle: Bundle, keys: Path) -> str:
             if fault:
                 raise BundleError(f"{file} {fault}")
             return name
-    raise BundleError(f"{file} was made with none of the keys in {keys} ({', '.join(verifiers)})")
+    also = f"; it {fault}" if fault else ""
+    raise BundleError(f"{file} was made with none of the keys in {keys} ({', '.join(verifiers)}){also}")
 
 
 def trusted(keys: Path) -> dict[str, Callable[[Path, Path], object]]:

@@ -21,7 +21,7 @@ async function main() {
   if (!WebAssembly.validate(new Uint8Array(SIMD)) || !window.DecompressionStream) {
     throw new Error("This browser is too old: the page needs WebAssembly with SIMD and DecompressionStream (2023).");
   }
-  const { policies } = await (await fetched("policies.json")).json();
+  const { policies } = await fetched("policies.json", reply => reply.json());
   const name = decodeURIComponent(location.hash.slice(1)), chosen = policies.find(one => one.name === name || !name);
   addEventListener("hashchange", () => location.reload());
   if (policies.length > 1) {

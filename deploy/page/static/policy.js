@@ -8,26 +8,32 @@ const ARRAYS = {
   bool: Uint8Array,
 };
 
-// A file of the page, from the server each time it has changed.
-export async function fetched(path) {
-  const reply = await fetch(path, { cache: "no-cache" });
-  if (!reply.ok) throw new Error(`${path} cannot be fetched: ${reply.status} ${reply.statusText}`);
-  return reply;
+// What `read` makes of a file of the page, which comes from the server each time it has changed.
+export async function fetched(path, read) {
+  try {
+    const reply = await fetch(path, { cache: "no-cache" });
+    if (!reply.ok) throw new Error(`${reply.status} ${reply.statusText}`);
+    return await read(reply);
+  } catch (error) {
+    throw new Error(`${path} cannot be fetched: ${error.message || error}`);
+  }
 }
 
 // WebAssembly that is packed with gzip; some servers unpack it on the way.
-export async function wasm(path) {
-  const content = await (await fetched(path)).arrayBuffer();
-  if (new Uint8Array(content)[0] !== 0x1f) return content;
-  return new Response(new Blob([content]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+export function wasm(path) {
+  return fetched(path, async reply => {
+    const content = await reply.arrayBuffer();
+    if (new Uint8Array(content)[0] !== 0x1f) return content;
+    return new Response(new Blob([content]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+  });
 }
 
 export class Policy {
   static async load(folder) {
     const [facts, data, graph, binary] = await Promise.all([
-      fetched(`${folder}/facts.json`).then(reply => reply.json()),
-      fetched(`${folder}/data.bin`).then(reply => reply.arrayBuffer()),
-      fetched(`${folder}/policy.onnx`).then(reply => reply.arrayBuffer()),
+      fetched(`${folder}/facts.json`, reply => reply.json()),
+      fetched(`${folder}/data.bin`, reply => reply.arrayBuffer()),
+      fetched(`${folder}/policy.onnx`, reply => reply.arrayBuffer()),
       wasm("lib/onnxruntime.wasm.gz"),
     ]);
     Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary: binary });

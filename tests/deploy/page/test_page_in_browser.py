@@ -305,7 +305,14 @@ def test_an_action_outside_its_space_is_said_and_not_shown(browser: Browser, pag
 def test_a_broken_graph_and_a_missing_file_are_one_sentence(browser: Browser, page: Path) -> None:
     (page / "policies" / "cartpole_dqn" / "policy.onnx").write_bytes(b"no graph")
     (page / "policies" / "pendulum_sac" / "data.bin").unlink()
-    for name, words in (("cartpole_dqn", "ERROR_CODE"), ("pendulum_sac", "data.bin cannot be fetched: 404")):
+    for file in (page / "policies" / "ur5_positioning" / "facts.json", page / "lib" / "mujoco.wasm.gz"):
+        file.write_bytes(file.read_bytes()[:-100])
+    for name, words in (
+        ("cartpole_dqn", "ERROR_CODE"),
+        ("pendulum_sac", "data.bin cannot be fetched: 404"),
+        ("ur5_positioning", "facts.json cannot be fetched: "),
+        ("mir100_navigation", "mujoco.wasm.gz cannot be fetched: "),
+    ):
         with opened(browser, page, name) as tab:
             assert tab.evaluate(STATE) == "broken"
             assert words in tab.evaluate("document.querySelector('#status').innerText")

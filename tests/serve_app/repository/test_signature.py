@@ -197,9 +197,14 @@ def test_an_issuer_stands_for_its_certificates_until_they_expire(tmp_path: Path,
     private, leaf, issuers = certified(tmp_path / "old", (-200, -100))
     with pytest.raises(BundleError, match="with none of the keys"):
         check_signature(bundle, issuers)
+    write(tmp_path, "team")
+    team = tmp_path / "keys" / "team.pem"
     file = sign(bundle, private, leaf)
-    with pytest.raises(BundleError, match=r"has a certificate of 'CN=leaf' that is valid from \d{4}-\d\d-\d\d to"):
+    reason = r"has a certificate of 'CN=leaf' that is valid from \d{4}-\d\d-\d\d to"
+    with pytest.raises(BundleError, match=reason):
         check_signature(bundle, issuers)
+    with pytest.raises(BundleError, match=rf"with none of the keys in .* \(team\.pem\); it {reason}"):
+        check_signature(bundle, team)
     # The library takes the names of protobuf as well as those of JSON.
     signature = json.loads(file.read_text())
     chain = signature["verificationMaterial"].pop("x509CertificateChain")
