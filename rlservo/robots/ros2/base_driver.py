@@ -345,7 +345,8 @@ class RosBase:
         if (way > JUMP + 2.0 * FASTEST * passed_s).any():
             jump = f"{way[0]:.2f} m and {way[1]:.2f} rad in {passed_s:.2f} s"
             self.fault = self.fault or (
-                f"odometry_jumped: {self.address['odom']} moved by {jump}: is it published twice, or was it reset"
+                f"odometry_jumped: {self.address['odom']} moved by {jump}: is it published twice, or was it or its "
+                "clock reset"
             )
 
     def _check_progress(self, passed_s: float) -> None:
