@@ -152,8 +152,8 @@ def _check_sizes(
     least = sum((term.size or 1) * term.history for term in said.terms)
     if main is not None and least > (own := int(np.prod(main.row))):
         raise CheckpointError(
-            f"{said.place}: its observation terms with their histories have at least {least} elements, '{main.name}' of "
-            f"{file.name} has {own}"
+            f"{said.place}: its observation terms with their histories have at least {least} elements, "
+            f"'{main.name}' of {file.name} has {own}"
         )
     for what, size, tensor in sizes:
         if size is not None and tensor is not None and size != (own := int(np.prod(tensor.row))):
