@@ -30,6 +30,7 @@ pytestmark = pytest.mark.slow
 
 STATE = "document.body.dataset.state"
 NO_PICTURE = "HTMLCanvasElement.prototype.getContext = () => null"
+SLOW = "requestAnimationFrame = frame => setTimeout(() => frame(performance.now()), 400)"
 ROBOTS = (
     "ur5_positioning", "ur_positioning", "ur10_isaac_reach", "panda_positioning", "mir100_navigation",
     "mir100_obstacle_avoidance", "mir100_sparse_fixes",
@@ -263,9 +264,8 @@ def test_a_policy_that_the_page_lacks_is_not_replaced_by_another(browser: Browse
 
 
 def test_a_slow_browser_is_shown_as_slow(browser: Browser, site: Path) -> None:
-    slow = "requestAnimationFrame = frame => setTimeout(() => frame(performance.now()), 400)"
     with web_server(site) as address, browser.tab() as tab:
-        tab.call("Page.addScriptToEvaluateOnNewDocument", source=f"{NO_PICTURE}; {slow}")
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source=f"{NO_PICTURE}; {SLOW}")
         tab.visit(f"{address}#ur5_positioning")
         tab.wait_for("/slow browser/.test(document.querySelector('#now').innerText)")
         tab.wait_for("parseInt(document.querySelector('#now dd:last-child').innerText) < 40")
@@ -399,11 +399,11 @@ def test_memory_moves_on_and_names_stay_text(
 
 
 def rewrite(folder: Path, description: str) -> None:
-    """Give a bundle another description."""
+    """Give a bundle another description, and no rate."""
     from rlservo.bundle import bundle as bundle_files
 
     contract = bundle_files.read_contract(folder)
-    bundle_files.write_contract(folder, contract.model_copy(update={"description": description}))
+    bundle_files.write_contract(folder, contract.model_copy(update={"description": description, "control_rate_hz": None}))
 
 
 @pytest.mark.parametrize("width", [390, 1280])
@@ -411,6 +411,9 @@ def rewrite(folder: Path, description: str) -> None:
 def test_page_fits_a_phone_and_a_desk(browser: Browser, site: Path, name: str, width: int) -> None:
     with web_server(site) as address, browser.tab() as tab:
         tab.resize(width, 844)
+        tab.call("Page.addScriptToEvaluateOnNewDocument", source=SLOW)  # which is one line more
         tab.visit(f"{address}#{name}")
         tab.wait_for(f"{STATE} === 'running'")
+        if name == "mir100_obstacle_avoidance":
+            tab.wait_for("document.querySelector('#now').innerText.includes('slow browser')")
         assert tab.evaluate("document.documentElement.scrollWidth") <= width

@@ -6,14 +6,13 @@ import functools
 import http.server
 import json
 import runpy
-import shutil
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from bundles import write_box_policy
+from bundles import write_box_policy, write_leaky_policy
 from command_line import rlservo
 from rlservo.bundle import bundle as bundle_files
 from rlservo.deploy.page import npm_packages, static_site
@@ -167,7 +166,8 @@ def test_a_policy_of_another_rate_than_its_simulator_is_refused(
     all_shipped: Path,
     tmp_path: Path,
 ) -> None:
-    folder = Path(shutil.copytree(all_shipped / "mir100_navigation" / "1", tmp_path / "mir" / "1"))
+    shipped = bundle_files.read_contract(all_shipped / "mir100_navigation" / "1")
+    folder = write_leaky_policy(tmp_path, like=shipped)
     contract = bundle_files.read_contract(folder)
     bundle_files.write_contract(folder, contract.model_copy(update={"control_rate_hz": 15.0}))
     with pytest.raises(UsageError, match=r"acts at 15 Hz, but .*NoObstacleNavigationMir100Sim-v0 at 10 Hz"):
