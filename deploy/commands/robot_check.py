@@ -34,7 +34,7 @@ def robot_check(
     with one_sentence_errors():
         from rlservo.robots.readiness import Finding, look_at
 
-        model, findings = look_at(robot, ur_model, parse_env_arguments(limit or []))
+        model, findings, _ = look_at(robot, ur_model, parse_env_arguments(limit or []))
         if bundle is not None:
             problem = _bundle_problem(bundle, robot, model)
             findings.append(Finding("bundle", "refused" if problem else "may drive it", problem))

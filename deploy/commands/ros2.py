@@ -129,6 +129,9 @@ def ros2_sim(
         Literal["position", "velocity", "trajectory"], typer.Option(help="Arm: the active controller.")
     ] = "position",
     prefix: Annotated[str, typer.Option(help="Arm: prefix of the joint names.")] = "",
+    calibrated: Annotated[
+        bool, typer.Option("--calibrated", help="Arm: kinematics a few millimetres off the data sheet's.")
+    ] = False,
     world: Annotated[str, typer.Option(help="Base: world, empty or lab_6x8.")] = "empty",
     twist: Annotated[Literal["Twist", "TwistStamped"], typer.Option(help="Base: type of /cmd_vel.")] = "Twist",
     rosbridge_port: Annotated[
@@ -175,8 +178,11 @@ def ros2_sim(
                 cleanup.callback(base.close)
             else:
                 from rlservo.robots.simulated.ros2_arm import SimulatedArm
+                from rlservo.robots.simulated.ur_controller.controller import DEVIATIONS
+                from rlservo.robots.ur.calibration import data_sheet
 
-                arm = SimulatedArm(robot, controller=controller, prefix=prefix, faults=LinkFaults())
+                own = data_sheet(robot) + DEVIATIONS if calibrated else None
+                arm = SimulatedArm(robot, controller=controller, prefix=prefix, faults=LinkFaults(), kinematics=own)
                 simulated = arm
                 cleanup.callback(arm.close)
                 where.append(f"ROS 2, {controller} controller")

@@ -44,13 +44,15 @@ class Finding(NamedTuple):
     numbers: Sequence[Any] = ()
 
 
-def look_at(robot: str, ur_model: str | None, limits: Mapping[str, Any]) -> tuple[str, list[Finding]]:
-    """Return a robot's model, empty for a base, and the findings. Raises RobotError if it cannot be reached at all.
+def look_at(robot: str, ur_model: str | None, limits: Mapping[str, Any]) -> tuple[str, list[Finding], Vector | None]:
+    """Return a robot's model, empty for a base, the findings, and the frames of an arm's kinematics if it tells them.
+
+    Raises RobotError if it cannot be reached at all.
 
     `robot` is 'rtde://HOST', 'ros2:...' (an arm) or 'rosbridge://HOST:PORT' (a base).
     """
     if robot.startswith(ROSBRIDGE):
-        return "", _base(robot, limits)
+        return "", _base(robot, limits), None
     checked, host = Limits.of(limits), host_of(robot)
     if host is None:
         raise RobotError(f"robot {robot!r} is simulated: expected rtde://HOST, ros2: or rosbridge://HOST:PORT")
@@ -58,15 +60,18 @@ def look_at(robot: str, ur_model: str | None, limits: Mapping[str, Any]) -> tupl
         from rlservo.robots.ros2.arm_driver import RosArmConnection
 
         model = ur_model or "ur5e"
+        known = Finding("model", f"{model} ({'given' if ur_model else 'assumed: give --ur-model'})", _unknown(model))
+        if known.problem:
+            return model, [known], None
         with closing(RosArmConnection(ServoSettings(host, model, 0.1, 0.25, checked, 0, 0))) as driver:
-            return model, [
-                Finding("model", f"{model} ({'given' if ur_model else 'assumed: give --ur-model'})", _unknown(model)),
-                Finding("calibration", "not read through ROS 2: kinematics are the data sheet's"),
-                *_state(driver.read, model, checked),
-            ]
+            own, states = driver.frames, _state(driver.read, model, checked, driver.frames)
+        calibration = Finding("calibration", f"{driver.without_frames}: kinematics are the data sheet's")
+        if own is not None:
+            calibration = _compared("description", own, model)
+        return model, [known, calibration, *states], own
     model, findings = _dashboard(host, ur_model)
-    calibration = _calibration(host, model)
-    return model, [*findings, calibration, *_over_rtde(host, model, checked, calibration.numbers)]
+    calibration, own = _calibration(host, model)
+    return model, [*findings, calibration, *_over_rtde(host, model, checked, own)], own
 
 
 def present_state(host: str, ur_model: str, limits: Limits) -> tuple[Vector, float, Vector | None]:
@@ -74,17 +79,12 @@ def present_state(host: str, ur_model: str, limits: Limits) -> tuple[Vector, flo
 
     Raises RobotError if it may not be driven.
     """
-    _, findings = look_at(host if host.startswith(ROS2) else f"{RTDE}{host}", ur_model, dataclasses.asdict(limits))
+    _, findings, own = look_at(host if host.startswith(ROS2) else f"{RTDE}{host}", ur_model, dataclasses.asdict(limits))
     found = {one.what: one for one in findings}
     problems = [one for one in findings if one.problem and not (one.what == "states" and "joints" in found)]
     if problems:
         raise RobotError("; ".join(f"{one.what}: {one.found}: {one.problem}" for one in problems))
-    own = found["calibration"].numbers
-    return (
-        np.array(found["joints"].numbers),
-        found["speed slider"].numbers[0],
-        frames_of(np.array(own)) if own else None,
-    )
+    return np.array(found["joints"].numbers), found["speed slider"].numbers[0], own
 
 
 def _dashboard(host: str, ur_model: str | None) -> tuple[str, list[Finding]]:
@@ -124,20 +124,24 @@ def _unknown(model: str) -> str:
     return f"its kinematics are unknown here: expected one of {', '.join(UR_PARAMETERS)}"
 
 
-def _calibration(host: str, model: str) -> Finding:
+def _calibration(host: str, model: str) -> tuple[Finding, Vector | None]:
     try:
         parameters, state = read_calibration(host)
     except RobotError as error:
-        return Finding("calibration", "none", str(error))
+        return Finding("calibration", "none", str(error)), None
     if model not in UR_PARAMETERS:
-        return Finding("calibration", state)
+        return Finding("calibration", state), None
     frames = frames_of(parameters)
+    return _compared(state, frames, model)._replace(numbers=parameters.tolist()), frames
+
+
+def _compared(source: str, frames: Vector, model: str) -> Finding:
     off = deviation_m(model, frames)
-    found = f"{state}: the flange is up to {1e3 * off:.1f} mm from the data sheet's"
-    return Finding("calibration", found, too_far(off, model) if off > MOST else "", parameters.tolist())
+    found = f"{source}: the flange is up to {1e3 * off:.1f} mm from the data sheet's"
+    return Finding("calibration", found, too_far(off, model) if off > MOST else "")
 
 
-def _over_rtde(host: str, model: str, limits: Limits, own: Sequence[Any]) -> list[Finding]:
+def _over_rtde(host: str, model: str, limits: Limits, own: Vector | None) -> list[Finding]:
     import rtde_receive
 
     rate_hz = limits.rate_hz or rate_hz_of(model)
@@ -155,7 +159,7 @@ def _over_rtde(host: str, model: str, limits: Limits, own: Sequence[Any]) -> lis
         receive.disconnect()
 
 
-def _state(read: Callable[[], ArmReading], model: str, limits: Limits, own: Sequence[Any] = ()) -> list[Finding]:
+def _state(read: Callable[[], ArmReading], model: str, limits: Limits, own: Vector | None) -> list[Finding]:
     """Return what a second of states says."""
     times_s, arrivals_s, began = [0.0], [0.0], time.monotonic()
     while (now := time.monotonic()) < began + (WATCHED_S if len(times_s) > 1 else FIRST_STATE_S):
@@ -189,13 +193,13 @@ def _state(read: Callable[[], ArmReading], model: str, limits: Limits, own: Sequ
     ]
 
 
-def _joints(joints: Vector, model: str, limits: Limits, own: Sequence[Any]) -> list[Finding]:
+def _joints(joints: Vector, model: str, limits: Limits, own: Vector | None) -> list[Finding]:
     listed = ", ".join(f"{joint:z.2f}" for joint in joints)
     if model not in UR_PARAMETERS:
         return [Finding("joints", f"{listed} rad", "", tuple(joints.tolist()))]
     simulation = URSimulation(model, objects=())
-    if own:
-        simulation.calibrate(frames_of(np.array(own)))
+    if own is not None:
+        simulation.calibrate(own)
     limiter = MotionLimiter(limits, simulation, np.ones(6), 0.01)
     limiter.restart(joints.tolist())
     problem = ""

@@ -12,7 +12,7 @@ from rlservo.robots.arm_interface import RUNNING, SAFE_MODES, STOP_NAMES, RobotE
 from rlservo.robots.arm_port import ZERO_SCALE, ArmReading, ServoSettings
 from rlservo.robots.following_error import FollowingBound
 from rlservo.robots.rtde_probe import no_answer
-from rlservo.robots.ur.calibration import own_frames
+from rlservo.robots.ur.calibration import checked, frames_of, read_calibration
 from rlservo.robots.ur.parameters import CB3, UR_PARAMETERS, model_of, rate_hz_of
 
 FIRST_STATE_S = 5.0
@@ -48,7 +48,7 @@ class RtdeDriver:
             dashboard.disconnect()
         except RuntimeError as error:
             raise RobotError(no_answer(host, error)) from error
-        self.frames: Vector | None = own_frames(host, settings.ur_model)
+        self.frames: Vector | None = checked(frames_of(read_calibration(host)[0]), settings.ur_model)
         fastest = rate_hz_of(settings.ur_model)
         self.rate_hz = limits.rate_hz or fastest
         if self.rate_hz > fastest:

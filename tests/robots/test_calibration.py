@@ -8,16 +8,19 @@ here from the definition of Denavit and Hartenberg.
 from __future__ import annotations
 
 import json
+import re
 import socket
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import Any
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from arms import LIMITS, RunningArm, run_arm
 from command_line import rlservo
@@ -28,8 +31,10 @@ from rlservo.robots.following_error import FollowingBound
 from rlservo.robots.limits import Limits
 from rlservo.robots.servo_loop import ORDERS, REPORT, ServoLoop
 from rlservo.robots.shared_block import make_file
+from rlservo.robots.simulated.ros2_arm import description
 from rlservo.robots.simulated.ur_controller.controller import DEVIATIONS
-from rlservo.robots.ur.calibration import data_sheet, deviation_m, frames_of, own_frames, read_calibration
+from rlservo.robots.ur.calibration import checked, data_sheet, deviation_m, frames_of, read_calibration
+from rlservo.robots.ur.description import frames_of_description
 from rlservo.robots.ur.simulation import URSimulation
 
 UR5E = np.array(
@@ -41,6 +46,8 @@ UR5E = np.array(
         [1.5700052415988, -0.00131879150548935, 0.00455096395056942, 1.57044157216112, -1.57135106820315, 0.0],
     ]
 )  # fmt: skip
+URDF_JOINTS = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint",
+               "wrist_3_joint")  # fmt: skip
 CHECKSUMS = (3042159723, 2825233598, 3038656413, 2837741972, 2836111355, 2833694156)
 
 
@@ -124,9 +131,9 @@ def test_arm_of_other_kinematics_is_refused() -> None:
         primary(robot_state(data_sheet("ur10e"))) as host,
         pytest.raises(RobotError, match=r"a ur5e's: expected 0\.03"),
     ):
-        own_frames(host, "ur5e")
+        checked(frames_of(read_calibration(host)[0]), "ur5e")
     with primary(robot_state(np.zeros((4, 6)))) as host, pytest.raises(RobotError, match="is the model right"):
-        own_frames(host, "ur5e")
+        checked(frames_of(read_calibration(host)[0]), "ur5e")
 
 
 @pytest.mark.parametrize("tool", ["tool0", "tool1"])
@@ -150,6 +157,99 @@ def test_model_with_an_arms_own_kinematics_has_its_flange_where_the_controller_h
     assert deviation_m("ur5e", frames_of(UR5E)) == pytest.approx(farthest, rel=0.3)
     links = nominal.model.body_pos - own.model.body_pos
     assert 0.0002 < np.abs(links).max() < 0.003  # the links stay where they are
+
+
+def urdf_of(parameters: np.ndarray, prefix: str = "", joints: Sequence[str] = URDF_JOINTS) -> str:
+    """Return a URDF as ur_description has it.
+
+    Each link is drawn along its axis to where the last one is, as ur_calibration does, and turned about it: neither
+    moves the flange. ros2_control names the same joints once more.
+    """
+    frames = [np.eye(4)]
+    for number in range(6):
+        frames.append(flange_of(parameters[:, : number + 1], np.zeros(number + 1)))
+    frames[0][2, 3] = 0.16
+    for number in range(1, 6):
+        axis, (start, before) = frames[number][:3, 2], (frames[number][:3, 3], frames[number - 1][:3, 3])
+        frames[number][:3, 3] = start - axis * (axis @ (start - before))
+        frames[number][:3, :3] @= Rotation.from_euler("z", 0.3 * number).as_matrix()
+    steps = [np.linalg.inv(a) @ b for a, b in zip([np.eye(4), *frames], [*frames, np.eye(4)], strict=True)][:7]
+    links = ("base_link_inertia", "shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link",
+             "wrist_3_link", "tool0")  # fmt: skip
+    names = [*joints, "wrist_3-tool0"]
+    turned = 'xyz="0 0 0" rpy="0 0 3.141592653589793"'
+    text = "".join(
+        f'<joint name="{p}{child}_fixed" type="fixed"><parent link="{p}base_link"/><child link="{p}{child}"/>'
+        f"<origin {turned}/></joint>"
+        for p in (prefix,) for child in ("base_link_inertia", "base")
+    )  # fmt: skip
+    for number, (name, step) in enumerate(zip(names, steps, strict=True)):
+        xyz = " ".join(map(repr, step[:3, 3].tolist()))
+        rpy = " ".join(map(repr, Rotation.from_matrix(step[:3, :3]).as_euler("xyz").tolist()))
+        turns = '<axis xyz="0 0 1"/><limit lower="-6.3" upper="6.3" effort="1" velocity="1"/>' if number < 6 else ""
+        text += (
+            f'<joint name="{prefix}{name}" type="{"revolute" if number < 6 else "fixed"}">'
+            f'<origin xyz="{xyz}" rpy="{rpy}"/>'
+            f'<parent link="{prefix}{links[number]}"/><child link="{prefix}{links[number + 1]}"/>{turns}</joint>'
+        )
+    bodies = "".join(f'<link name="{prefix}{link}"/>' for link in ("base_link", "base", *links))
+    control = "".join(f'<joint name="{prefix}{name}"/>' for name in joints)
+    return f'<robot name="ur"><ros2_control name="ur" type="system">{control}</ros2_control>{bodies}{text}</robot>'
+
+
+def flanges_by_mujoco(text: str, poses: np.ndarray, prefix: str = "") -> Iterator[np.ndarray]:
+    """Yield the flange's positions [m] in base_link by MuJoCo's own reader of URDF, which wants masses."""
+    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = re.sub(r'<link name="([^"]*)"/>', rf'<link name="\1">{mass}</link>', text)
+    text = text.replace('<robot name="ur">', '<robot name="ur"><mujoco><compiler fusestatic="false"/></mujoco>')
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    for angles in poses:
+        for name, angle in zip(URDF_JOINTS, angles, strict=True):
+            data.joint(prefix + name).qpos = angle
+        mujoco.mj_kinematics(model, data)
+        yield data.body(prefix + "tool0").xpos.copy()
+
+
+@pytest.mark.parametrize("prefix", ["", "left_"])
+def test_robot_description_has_the_flange_where_mujoco_and_the_controller_have_it(prefix: str) -> None:
+    """MuJoCo reads the URDF by its own code; the controller's kinematics are those of Denavit and Hartenberg."""
+    text, poses = urdf_of(UR5E, prefix), np.random.default_rng(4).uniform(-np.pi, np.pi, (50, 6))
+    frames = frames_of_description(text, [prefix + name for name in URDF_JOINTS], prefix)
+    assert deviation_m("ur5e", frames) == pytest.approx(deviation_m("ur5e", frames_of(UR5E)), abs=1e-9)
+    ours = URSimulation("ur5e", objects=())
+    ours.calibrate(frames)
+    for angles, theirs in zip(poses, flanges_by_mujoco(text, poses, prefix), strict=True):
+        expected = in_base_link(flange_of(UR5E, angles))[:3, 3]
+        assert theirs == pytest.approx(expected, abs=1e-9)
+        assert ours.tool_at(angles)[0] == pytest.approx(expected, abs=1e-9)
+
+
+def test_simulated_arms_description_is_that_of_its_kinematics() -> None:
+    text, poses = description(UR5E, URDF_JOINTS, ""), np.random.default_rng(5).uniform(-np.pi, np.pi, (50, 6))
+    for angles, flange in zip(poses, flanges_by_mujoco(text, poses), strict=True):
+        assert flange == pytest.approx(in_base_link(flange_of(UR5E, angles))[:3, 3], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("<robot", "it is not XML"),
+        ("<robot/>", "it has no link base"),
+        (urdf_of(UR5E).replace('link="tool0"', 'link="hand"'), "it has no link tool0"),
+        (urdf_of(UR5E, "left_"), "it has no link base"),
+        (
+            urdf_of(UR5E, joints=[*URDF_JOINTS[1:], URDF_JOINTS[0]]),
+            "joints before tool0 are shoulder_lift_joint, elbow",
+        ),
+        (urdf_of(UR5E).replace('axis xyz="0 0 1"', 'axis xyz="0 1 0"', 1), "a joint does not turn about z"),
+        (urdf_of(UR5E).replace('xyz="0.0 ', 'xyz="nan ', 1), "the origin of .* has xyz 'nan"),
+        (urdf_of(UR5E).replace('xyz="0.0 ', 'xyz="', 1), "the origin of .* has xyz '"),
+    ],
+)
+def test_description_of_another_robot_is_one_sentence(text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        frames_of_description(text, URDF_JOINTS)
 
 
 def test_every_models_data_sheet_leaves_its_model_as_it_is() -> None:

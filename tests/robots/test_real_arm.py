@@ -339,7 +339,7 @@ def test_wrong_model_and_unreachable_host_are_one_sentence(arm: RunningArm) -> N
 
 def test_joint_outside_its_range_is_refused_before_anything_moves(arm: RunningArm) -> None:
     limits = Limits(watchdog_hz=1.0, position_low=(-6.0, -2.0, -3.0, -6.0, -6.0, -6.0))
-    with pytest.raises(RobotError, match=r"shoulder is at -2\.5 rad, outside its limits of -2 to 6\.28 rad: lead it"):
+    with pytest.raises(RobotError, match=r"shoulder is at -2\.5 rad, outside its limits of -2 to 6\.28 rad: move it"):
         ArmProcess(arm.host, "ur5", limits=limits)
     with pytest.raises(RobotError, match=r"rate_hz is 250: the controller takes at most 125"):
         ArmProcess(arm.host, "ur5", limits=Limits(rate_hz=250.0))

@@ -34,6 +34,7 @@ ARM_OPTIONS = {
     "status": "on",  # off: a robot without speed scaling, modes and program state
     "clock": "ros",
     "joint_states": "/joint_states",
+    "robot_description": "/robot_description",
     "speed_scaling": "/speed_scaling_state_broadcaster/speed_scaling",
     "robot_mode": "/io_and_status_controller/robot_mode",
     "safety_mode": "/io_and_status_controller/safety_mode",

@@ -18,9 +18,11 @@ from rlservo.robots.ros2.address import ARM_OPTIONS, COMMAND_TOPICS, LATER_TOPIC
 from rlservo.robots.ros2.link import (
     CLOCK_TOLERANCE_S,
     FIRST_MESSAGES_S,
+    LOOK_S,
     WATCH_S,
     check_clock,
     check_publisher,
+    log,
     take_command,
     wait_until,
 )
@@ -33,10 +35,13 @@ from rlservo.robots.ros2.ros_messages import (
     JOINT_TRAJECTORY,
     NUMBER,
     NUMBERS,
+    STRING,
     in_order,
     stamp_of,
     trajectory,
 )
+from rlservo.robots.ur.calibration import checked
+from rlservo.robots.ur.description import frames_of_description
 
 RATE_HZ = {"position": 125.0, "velocity": 125.0, "trajectory": 50.0}  # of commands, if the limits name none
 # The driver does not publish the controller's own target: the measured positions lag by the drives as well.
@@ -56,13 +61,12 @@ JUMP_MARGIN_S = 0.5  # [s] by which two stamps may be farther apart than the mes
 DRIFT_GAIN, DRIFT = 2.0, 0.002  # [1/s], of velocity commands; [rad] that is left at rest
 SCALE_FALL, LEAST_SCALE = 1.0, 0.05  # [1/s], by which velocity commands follow a falling speed scaling; its least
 LAST_S = 0.2  # [s] for the last velocity, zero, to leave
+DESCRIPTION_S = 1.0  # [s] for the robot's description, after everything else has come
 KINDS = {"position": NUMBERS, "velocity": NUMBERS, "trajectory": JOINT_TRAJECTORY}
 
 
 class RosArmConnection:
     """The arm's topics."""
-
-    frames: Vector | None = None
 
     def __init__(self, settings: ServoSettings) -> None:
         """Wait for every input, then take the command topic. Raises RobotError."""
@@ -85,9 +89,11 @@ class RosArmConnection:
         self._setpoint: Vector | None = None
         self._scale = 1.0
         self._guard: subprocess.Popen[bytes] | None = None
+        self._description: list[str] = []
         self._link = RclpyLink("rlservo_arm")
         try:
             self._subscribe()
+            self.frames, self.without_frames = self._own_kinematics(settings.ur_model)
             topic = self._command_topic()
             name = topic.strip("/").partition("/")[0]
             self.hint = f"is its controller active (ros2 control switch_controllers --activate {name})"
@@ -231,6 +237,8 @@ class RosArmConnection:
     def _subscribe(self) -> None:
         address, link = self._address, self._link
         link.subscribe(address["joint_states"], JOINT_STATE, self._take_state)
+        description = address["robot_description"]
+        link.subscribe(description, STRING, lambda message: self._description.append(message.data), is_kept=True)
         if address["status"] == "on":
             self._modes.clear()
             link.subscribe(address["speed_scaling"], NUMBER, self._take_speed)
@@ -248,6 +256,20 @@ class RosArmConnection:
         wait_until(self._is_complete, self._missing, FIRST_MESSAGES_S)
         check_clock(link, address["joint_states"], self.read().age_s or 0.0)
         check_publisher(link, address["joint_states"])
+
+    def _own_kinematics(self, ur_model: str) -> tuple[Vector | None, str]:
+        """Return the frames of the robot's description, or why there are none. Raises RobotError for another arm's."""
+        until, topic = time.monotonic() + DESCRIPTION_S, self._address["robot_description"]
+        while not self._description and time.monotonic() < until:
+            time.sleep(LOOK_S)
+        if not self._description:
+            return None, f"no message on {topic}"
+        try:
+            frames = frames_of_description(self._description[-1], self._joints, self._address["prefix"])
+        except ValueError as error:
+            log.warning("kinematics are the data sheet's: %s cannot be used: %s", topic, error)
+            return None, f"{topic} cannot be used: {error}"
+        return checked(frames, ur_model), ""
 
     def _is_complete(self) -> bool:
         return self._state is not None and len(self._modes) == 3 and self._speed_percent == self._speed_percent

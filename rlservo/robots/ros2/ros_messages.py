@@ -28,7 +28,7 @@ TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStampe
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 NUMBERS, NUMBER, FLAG = "std_msgs/msg/Float64MultiArray", "std_msgs/msg/Float64", "std_msgs/msg/Bool"
-INT8 = "std_msgs/msg/Int8"
+INT8, STRING = "std_msgs/msg/Int8", "std_msgs/msg/String"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 JOINT_NAMES = parameters.JOINT_NAMES  # ROS names by our own, in kinematic order

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from itertools import repeat
 from typing import Any
@@ -21,6 +22,7 @@ from rlservo.robots.ros2.ros_messages import (
     JOINT_TRAJECTORY,
     NUMBER,
     NUMBERS,
+    STRING,
     stamp,
 )
 from rlservo.robots.simulated.ros2_loop import FaultyLink
@@ -33,6 +35,8 @@ VELOCITY_ACCELERATION = 25.0  # [rad/s^2], of speedj for velocity commands
 STATUS_PERIOD_S = 0.1
 # The driver's joint states are not in kinematic order.
 PUBLISHED_ORDER = ("shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3", "base")
+LINKS = ("base_link_inertia", "shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link",
+         "wrist_3_link")  # fmt: skip
 RESEND_PROGRAM = "/io_and_status_controller/resend_robot_program"
 
 Vector = NDArray[np.float64]
@@ -42,9 +46,11 @@ log = logging.getLogger("rlservo.robot")
 class SimulatedArm:
     """The arm with one active controller: position, velocity or trajectory."""
 
-    def __init__(self, ur_model: str, *, controller: str, prefix: str, faults: LinkFaults) -> None:
-        """Join the graph. Raises RobotError without rclpy, ValueError for an unknown model."""
-        self.controller = Controller(ur_model)
+    def __init__(
+        self, ur_model: str, *, controller: str, prefix: str, faults: LinkFaults, kinematics: Vector | None = None
+    ) -> None:
+        """Join the graph; `kinematics` as in `Controller`. Raises RobotError without rclpy, ValueError."""
+        self.controller = Controller(ur_model, kinematics=kinematics)
         self.link = faults
         self.messages = FaultyLink(faults)
         self.dt = self.controller.dt
@@ -63,6 +69,9 @@ class SimulatedArm:
             name: self.messages.outgoing([ros.advertise(ARM_OPTIONS[name], kind, is_kept=is_kept)])
             for name, kind, is_kept in topics
         }
+        ros.advertise(ARM_OPTIONS["robot_description"], STRING, is_kept=True)(
+            {"data": description(self.controller.kinematics, self._joints, prefix)}
+        )
         self._mode_field = "data" if mode_kinds[0] == INT8 else "mode"
         takers = {"position": self._take_position, "velocity": self._take_velocity, "trajectory": self._take_trajectory}
         kind = JOINT_TRAJECTORY if controller == "trajectory" else NUMBERS
@@ -168,6 +177,29 @@ class SimulatedArm:
         if is_normal and not self.controller.is_program_running:
             self.controller.start_program(repeat(None))
         return is_normal, "" if is_normal else f"the robot is in {self.controller.safety_mode.name.lower()}"
+
+
+def description(kinematics: Vector, joints: Sequence[str], prefix: str) -> str:
+    """Return the URDF (its links and joints only) of an arm with Denavit-Hartenberg parameters (4, 6)."""
+    parts = []
+
+    def add(name: str, parent: str, child: str, xyz: Sequence[float], rpy: Sequence[float], rest: str = "") -> None:
+        parts.append(
+            f'<link name="{prefix}{child}"/><joint name="{name}" type="{"revolute" if rest else "fixed"}">'
+            f'<parent link="{prefix}{parent}"/><child link="{prefix}{child}"/>'
+            f'<origin xyz="{" ".join(map(repr, xyz))}" rpy="{" ".join(map(repr, rpy))}"/>{rest}</joint>'
+        )
+
+    add(f"{prefix}base_link-base_fixed_joint", "base_link", "base", (0.0, 0.0, 0.0), (0.0, 0.0, math.pi))
+    add(f"{prefix}base_link-base_link_inertia", "base_link", LINKS[0], (0.0, 0.0, 0.0), (0.0, 0.0, math.pi))
+    moves = '<axis xyz="0 0 1"/><limit lower="-6.3" upper="6.3" effort="150" velocity="3.2"/>'
+    xyz, rpy = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    chain = zip(joints, LINKS[:-1], LINKS[1:], kinematics.T.tolist(), strict=True)
+    for joint, parent, child, (theta, a, d, alpha) in chain:
+        add(joint, parent, child, xyz, rpy, moves)
+        xyz, rpy = (a * math.cos(theta), a * math.sin(theta), d), (alpha, 0.0, theta)
+    add(f"{prefix}flange-tool0", LINKS[-1], "tool0", xyz, rpy)
+    return f'<robot name="ur"><link name="{prefix}base_link"/>{"".join(parts)}</robot>'
 
 
 def _dashboard_kind(name: str) -> str:

@@ -82,9 +82,8 @@ def deviation_m(ur_model: str, frames: Vector) -> float:
     return float(np.linalg.norm(ours - sheet, axis=1).max())
 
 
-def own_frames(host: str, ur_model: str) -> Vector:
-    """Return the frames of the arm at `host`. Raises RobotError if they are not those of a `ur_model`."""
-    frames = frames_of(read_calibration(host)[0])
+def checked(frames: Vector, ur_model: str) -> Vector:
+    """Return the frames. Raises RobotError if they are not those of a `ur_model`."""
     if (off := deviation_m(ur_model, frames)) > MOST:
         raise RobotError(f"calibration: {too_far(off, ur_model)}")
     return frames
@@ -97,7 +96,7 @@ def too_far(off: float, ur_model: str) -> str:
 
 def _flange(frames: Vector, joints: Vector) -> Vector:
     """Return the flange's positions [m] (n, 3) with the joints [rad] (n, 6)."""
-    poses: Any = np.eye(4)
+    poses: Any = frames[0]
     for before, after, angle in zip(frames, frames[1:], joints.T, strict=False):
         turn = np.zeros((len(angle), 4, 4))
         turn[:, 0, 0] = turn[:, 1, 1] = np.cos(angle)

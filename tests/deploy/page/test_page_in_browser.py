@@ -403,7 +403,9 @@ def rewrite(folder: Path, description: str) -> None:
     from rlservo.bundle import bundle as bundle_files
 
     contract = bundle_files.read_contract(folder)
-    bundle_files.write_contract(folder, contract.model_copy(update={"description": description, "control_rate_hz": None}))
+    bundle_files.write_contract(
+        folder, contract.model_copy(update={"description": description, "control_rate_hz": None})
+    )
 
 
 @pytest.mark.parametrize("width", [390, 1280])

@@ -25,6 +25,8 @@ from rlservo.robots.ros2.arm_driver import RosArmConnection
 from rlservo.robots.ros2.link import Endpoint, Publish
 from rlservo.robots.servo_loop import ORDERS, REPORT, ServoLoop
 from rlservo.robots.shared_block import make_file
+from rlservo.robots.simulated.ros2_arm import description
+from rlservo.robots.ur.calibration import data_sheet, frames_of
 from rlservo.robots.ur.simulation import URSimulation
 
 SETTINGS = ServoSettings("ros2:", "ur5", 0.1, 0.25, Limits(), 0, 0)
@@ -33,6 +35,8 @@ JOINTS = list(messages.JOINT_NAMES.values())
 
 class Driver:
     """A link to a driver that publishes at once what is subscribed to."""
+
+    knows_quality = True
 
     def __init__(self) -> None:
         self.takers: dict[str, Callable[[Any], None]] = {}
@@ -43,7 +47,7 @@ class Driver:
         self.values: dict[str, dict[str, Any]] = {
             "joint_states": {"name": [*JOINTS, "finger"], "position": [0.5] * 7, "velocity": [0.0] * 7},
             "speed_scaling": {"data": 100.0}, "program_running": {"data": True}, "robot_mode": {"data": 7},
-            "safety_mode": {"data": 1},
+            "safety_mode": {"data": 1}, "robot_description": {"data": description(data_sheet("ur5"), JOINTS, "")},
         }  # fmt: skip
 
     def now_s(self) -> float:
@@ -55,7 +59,9 @@ class Driver:
 
     def subscribe(self, topic: str, kind: str, on_message: Callable[[Any], None], *, is_kept: bool = False) -> None:
         self.takers[topic] = on_message
-        self.send(next(name for name, one in ARM_OPTIONS.items() if one == topic))
+        name = next(name for name, one in ARM_OPTIONS.items() if one == topic)
+        if name in self.values:
+            self.send(name)
 
     def advertise(self, topic: str, kind: str, *, is_kept: bool = False) -> Publish:
         return self.sent.append
@@ -110,6 +116,23 @@ def test_numbers_that_are_not_finite_never_replace_a_state(driver: Driver) -> No
     driver.values["joint_states"]["position"] = [math.nan] * 7
     driver.send("joint_states")
     assert arm.read().positions.tolist() == [0.5] * 6
+
+
+def test_kinematics_are_those_of_the_robots_description(driver: Driver, caplog: pytest.LogCaptureFixture) -> None:
+    own = data_sheet("ur5") + 1e-4
+    driver.values["robot_description"] = {"data": description(own, JOINTS, "")}
+    frames = RosArmConnection(SETTINGS).frames
+    assert frames is not None and np.abs(frames - frames_of(own)).max() < 1e-12
+    driver.values["robot_description"] = {"data": "<robot/>"}
+    assert RosArmConnection(SETTINGS).frames is None
+    assert caplog.messages == [
+        "kinematics are the data sheet's: /robot_description cannot be used: it has no link base"
+    ]
+    driver.values["robot_description"] = {"data": description(data_sheet("ur10e"), JOINTS, "")}
+    with pytest.raises(RobotError, match=r"calibration: the flange is up to .* m from a ur5's: expected 0\.03 m"):
+        RosArmConnection(SETTINGS)
+    del driver.values["robot_description"]
+    assert RosArmConnection(SETTINGS).without_frames == "no message on /robot_description"
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 50.0, 500.0])

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rlservo.robots.simulated.ur_controller.controller import DEVIATIONS
+from rlservo.robots.ur.calibration import data_sheet, deviation_m, frames_of
 from ros import STANDS, Process, Ros, SlowServer
 from servers import over_uvicorn
 
@@ -30,7 +32,7 @@ BRAKING_S = 1.0  # at 5 rad/s^2, servoj's lag and a busy machine
 @pytest.fixture(scope="module")
 def sim(ros: Ros) -> Process:
     """A UR5 whose joints have a prefix; its driver's joint states are in another order than ours."""
-    sim = ros.rlservo("ros2-sim", "ur5", "--prefix", PREFIX)
+    sim = ros.rlservo("ros2-sim", "ur5", "--prefix", PREFIX, "--calibrated")
     sim.wait_for("ur5 on ROS 2")
     ros.watch("/joint_states", "sensor_msgs/msg/JointState")
     return sim
@@ -302,6 +304,11 @@ def test_robot_check_describes_an_arm_on_ros_and_says_what_is_missing(ros: Ros, 
     code, found = check(ros, "--ur-model", "ur5")
     assert code == 0, found
     assert found["model"]["found"] == "ur5 (given)" and found["robot mode"]["found"] == "running"
+    off = 1e3 * deviation_m("ur5", frames_of(data_sheet("ur5") + DEVIATIONS))
+    assert found["calibration"]["found"] == f"description: the flange is up to {off:.1f} mm from the data sheet's"
+    process = ros.rlservo("robot-check", f"ros2:prefix={PREFIX}", "--ur-model", "ur10e")
+    assert process.end(0) == 2
+    assert "m from a ur10e's: expected 0.03 m at most: is the model right" in "".join(process.lines)
     code, found = check(ros, "--ur-model", "ur99")
     assert code == 1 and "expected one of ur3, ur3e" in found["model"]["problem"]
     sim.type("slider 0")
