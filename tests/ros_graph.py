@@ -131,6 +131,7 @@ def main() -> None:
         if action not in clients:
             clients[action] = ActionClient(node, made, action)
         assert clients[action].wait_for_server(60.0), f"no action {action}"
+        time.sleep(0.5)  # until the server has discovered us too: an answer before that is lost
         goal: dict[str, Any] = {"feedback": [], "ended_s": None}
         sent = clients[action].send_goal_async(
             fill(made.Goal(), values), lambda message: goal["feedback"].append((time.time(), message.feedback))
