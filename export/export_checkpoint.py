@@ -48,6 +48,7 @@ from rlservo.errors import (
     NoNetworkError,
     ParityError,
     RlservoError,
+    UnsupportedError,
     UsageError,
 )
 from rlservo.export.bundle_names import bundle_name, check_names, choose_target, default_name
@@ -364,6 +365,7 @@ def _write_graphs(
     Parts of the observation that nothing reads are not inputs.
     """
     from rlservo.export.graph.eager_checks import check_eager
+    from rlservo.export.graph.joined_rows import joined_rows
     from rlservo.export.graph.onnx_file import inputs_read, run_onnx, write_onnx
     from rlservo.export.graph.policy_graph import PolicyGraph
     from rlservo.export.graph.torchscript_file import run_torchscript, write_torchscript
@@ -388,6 +390,16 @@ def _write_graphs(
         return graph, frozen
 
     graph, frozen = write(())
+    joined = joined_rows(folder / ONNX_FILE, example)
+    if joined and restored.one_by_one is not None:
+        restored.one_by_one()
+        graph, frozen = write(())
+        joined = joined_rows(folder / ONNX_FILE, example)
+    if joined:
+        raise UnsupportedError(
+            f"the network's result depends on the other observations of the batch, which cannot be exported: {joined} "
+            "joins them; give the operation the axis of an observation's own numbers (dim=-1)"
+        )
     if left_out := _left_out(recipe, inputs_read(folder / ONNX_FILE)):
         graph, frozen = write(left_out)
     only_valued = _left_out(recipe, inputs_read(folder / ONNX_FILE, without=VALUE)) - left_out

@@ -48,7 +48,13 @@ def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
             _export(graph, example, file, dynamo=True)
             _finish(file, graph, example)
         except Exception as error:
-            raise UnsupportedError(why_not_onnx(graph, example, [error, first])) from error
+            # The second exporter takes no TorchScript.
+            errors = [first] if _has_script(graph) else [error, first]
+            raise UnsupportedError(why_not_onnx(graph, example, errors)) from error
+
+
+def _has_script(graph: PolicyGraph) -> bool:
+    return any(isinstance(part, torch.jit.ScriptModule) for part in graph.modules())
 
 
 def inputs_read(file: Path, *, without: str = "") -> set[str]:
@@ -61,18 +67,18 @@ def inputs_read(file: Path, *, without: str = "") -> set[str]:
         name = waiting.pop()
         if name not in found:
             found.add(name)
-            waiting += _reads(makers[name]) if name in makers else ()
+            waiting += reads(makers[name]) if name in makers else ()
     return found
 
 
-def _reads(node: onnx.NodeProto) -> Iterator[str]:
+def reads(node: onnx.NodeProto) -> Iterator[str]:
     """Yield a node's inputs, and the outer inputs of the graphs inside it."""
     yield from node.input
     for attribute in node.attribute:
         for graph in (attribute.g, *attribute.graphs):
             yield from (output.name for output in graph.output)
             for inner in graph.node:
-                yield from _reads(inner)
+                yield from reads(inner)
 
 
 def _finish(file: Path, graph: PolicyGraph, example: Inputs) -> None:
@@ -106,7 +112,7 @@ def _export(graph: PolicyGraph, example: Inputs, file: Path, *, dynamo: bool) ->
     arguments = tuple(torch.from_numpy(example[name]) for name in inputs)
     with _quiet(), exact_operators():
         model: Any = graph
-        if not dynamo and any(isinstance(part, torch.jit.ScriptModule) for part in graph.modules()):
+        if not dynamo and _has_script(graph):
             # The exporter's own trace calls no TorchScript; a module that was traced before has it inlined.
             model = torch.jit.freeze(torch.jit.trace(graph, arguments, check_trace=False))  # type: ignore[no-untyped-call]
         torch.onnx.export(

@@ -115,6 +115,7 @@ def _restore(description: Description, notify: Notify) -> RestoredPolicy:
         "leapp.InferenceManager",
         lambda: StageReplay(start, given, results, states),
         elements=ElementNames(_elements(given), _elements(results), float(rate) if rate else None),
+        one_by_one=network.one_by_one,
     )
 
 

@@ -2,7 +2,8 @@
 
 LEAPP traces a stage with one row, and nothing says how it treats several: a constant stays one row, an LSTM's state
 `[layers, 1, n]` has the batch elsewhere, a mean may be over all. The stages therefore get all rows at once only if that
-gives what they give for each row alone, otherwise one row after the other, in a loop that is part of the graph.
+gives what they give for each row alone, and if their graph joins no rows (`graph/joined_rows.py`); otherwise one row
+after the other, in a loop that is part of the graph.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,6 @@ from rlservo.export.sources.leapp_description import Description, LeappStage, St
 from rlservo.export.sources.onnx_stage import OnnxStage
 
 PROBE_ROWS = 11
-OUTLIERS = (1e2, 1e4, 1e8, 1e16)  # magnitudes of the last of these rows
 CRASHES = re.compile(r"aten::(quantized_)?(lstm|gru|rnn_tanh|rnn_relu)\(")
 """Operators that write out of bounds when a state has more rows than they were traced with (torch 2.13)."""
 
@@ -54,7 +55,12 @@ class Pipeline(nn.Module):
             if torch.equal(value, value[:1].expand_as(value))
         }
         """The outputs that no input changes."""
-        self.step = _at_once(step, takes, gives, rows, wanted) or _OneByOne(step, takes, gives, rows)
+        self._one_by_one = partial(_OneByOne, step, takes, gives, rows)
+        self.step = _at_once(step, takes, gives, rows, wanted) or self._one_by_one()
+
+    def one_by_one(self) -> None:
+        """Compute one row after the other."""
+        self.step = self._one_by_one()
 
     def forward(self, obs: Tree, state: Sequence[Tensor] = ()) -> tuple[Tensor, ...]:
         results: tuple[Tensor, ...] = self.step(*tree_leaves(obs), *state)
@@ -100,13 +106,12 @@ def _probe(
 
 
 def _draw(tensor: StageTensor, first: Tensor | None, numbers: np.random.Generator) -> Tensor:
-    """Return random values of several magnitudes, the last rows far outliers; integers stay what they begin with."""
+    """Return random values of several magnitudes; integers stay what they begin with."""
     shape = (PROBE_ROWS, *tensor.row)
     begin = torch.zeros(shape) if first is None else first.reshape(tensor.row).expand(shape)
     if first is not None and not first.is_floating_point():
         return begin.clone()
     spread = 10.0 ** numbers.uniform(-1.0, 1.0, (PROBE_ROWS, *[1] * len(tensor.row)))
-    spread[-len(OUTLIERS) :] = np.reshape(OUTLIERS, (-1, *[1] * len(tensor.row)))  # a stage may stop for one
     return begin + torch.from_numpy(spread * numbers.standard_normal(shape)).to(begin.dtype)
 
 

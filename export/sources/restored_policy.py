@@ -67,3 +67,5 @@ class RestoredPolicy:
     """Reason why the observation filter's statistics are not training's; '' if they are or there is no filter."""
     reference: str = ""
     """What `start_loop` starts, if it is not what the source's own `reference` says."""
+    one_by_one: Callable[[], None] | None = None
+    """Let the network compute one observation after the other, if it can also compute all at once."""

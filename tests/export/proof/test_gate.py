@@ -298,6 +298,13 @@ class StopsForOutliers(Honest):
         return torch.where((obs.abs() > self.limit).any(), 0.0, super().forward(obs))
 
 
+class StopsForARareOne(Honest):
+    """No sample is one, so that no comparison of actions shows it."""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return torch.where(is_rare(obs), 0.0, super().forward(obs))
+
+
 class FollowsTheFirst(Honest):
     def forward(self, obs: Tensor) -> Tensor:
         return super().forward(obs) + 0.01 * obs[:1, :1].tanh()
@@ -500,6 +507,7 @@ def export(module: nn.Module, out: Path, **options: Any) -> rlservo.ExportResult
         (FollowsTheFirst(), "depends on the other observations of the batch"),
         (StopsForOutliers(1e4), "depends on the other observations of the batch"),
         (StopsForOutliers(1e12), "depends on the other observations of the batch"),
+        (StopsForARareOne(), "depends on the other observations of the batch.* Reduce.* joins them"),
         (CountsRows(lambda obs: obs.shape[0] > 300), "changes in a batch of 301: it depends on"),
         (CountsRows(lambda obs: len(obs) % 3 == 0), "changes in a batch of 3: it depends on"),
         (CountsRows(lambda obs: obs.size(0) == 64), "changes in a batch of 64: it depends on"),

@@ -115,7 +115,7 @@ def test_constant_gains_are_given_with_every_action(format: str, tmp_path: Path,
     assert notices == []
 
 
-@pytest.mark.parametrize("limit", [50.0, 1e5])
+@pytest.mark.parametrize("limit", [50.0, 1e5, 1e20])
 @pytest.mark.parametrize("format", ["jit-trace", "onnx"])
 def test_a_stage_that_stops_for_an_outlier_stops_for_its_own_row_alone(
     format: str, limit: float, tmp_path: Path, notices: list[str]
