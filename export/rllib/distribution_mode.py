@@ -6,7 +6,7 @@ action twice.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -30,18 +30,25 @@ RLLIBS_OWN = ("ray.rllib.core.distribution.", "ray.rllib.models.torch.torch_acti
 
 def distribution_kind(kind: type) -> DistributionKind | None:
     """Return the kind of RLlib's distribution class; None for the user's own, whose samples are not known."""
-    return DISTRIBUTIONS.get(kind.__name__) if kind.__module__.startswith(RLLIBS_OWN) else None
+    return DISTRIBUTIONS.get(kind.__name__) if _is_rllibs(kind) else None
 
 
-def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: Any, given: Tensor) -> Mode:
-    """Return the rule from the parameters of distribution `name` to its deterministic action.
+def _is_rllibs(kind: type) -> bool:
+    return kind.__module__.startswith(RLLIBS_OWN)
 
-    `deterministic` gives it for parameters `[batch, n]`, such as the network's own `given`; "given" means that no known
-    rule does, so the graph evaluates the distribution. Raises UnsupportedError if it fails or answers at random.
+
+def find_mode(deterministic: Callable[[Tensor], Tree], kinds: Sequence[type], action_space: Any, given: Tensor) -> Mode:
+    """Return the rule from a distribution's parameters to its deterministic action.
+
+    `deterministic` gives it for parameters `[batch, n]`, such as the network's own `given`; `kinds` are the
+    distribution's class and those of its parts. "given" means that no known rule does, or that a class is the user's
+    own, which may follow a rule on few numbers only: the graph evaluates the distribution. Raises UnsupportedError if
+    it fails or answers at random.
 
     RLlib 2.60 sends SAC's bare mean on the new API stack where
     the old one and other versions send its tanh: the class in the checkpoint decides.
     """
+    name = kinds[0].__name__
     spaces = space_leaves(action_space, "action")
     widths = [parameter_count(space) for space in spaces.values()]
     generator = torch.Generator().manual_seed(0)
@@ -58,7 +65,7 @@ def find_mode(deterministic: Callable[[Tensor], Tree], name: str, action_space: 
             f"the action distribution {name} draws its deterministic action at random: an export can only be proven if "
             "it gives the same action each time"
         )
-    if given.shape[-1] != sum(widths):
+    if given.shape[-1] != sum(widths) or not all(map(_is_rllibs, kinds)):
         return "given"
     actions = tree_leaves(deterministic(probe.clone()))
     found: set[Mode] = set()

@@ -40,6 +40,8 @@ OBSERVATIONS, ACTION_MASK = "observations", "action_mask"
 """Keys of the observation of a policy with action masks, as RLlib's examples have them."""
 ACTING = ("predict", "_predict", "obs_to_tensor", "unscale_action")
 """Methods through which predict passes around a policy's networks; `forward` is one of them if nothing else acts."""
+CHOOSING = ("get_distribution", "_get_action_dist_from_latent")
+"""Methods between the output of `action_net` and the action."""
 LIBRARIES = ("stable_baselines3", "sb3_contrib")
 EXPORTED = "expected Box, Discrete, MultiDiscrete or MultiBinary"
 MASKED = torch.finfo(torch.float32).min
@@ -142,13 +144,22 @@ def _check_methods(file: Path, policy: Any) -> None:
     for part in policy.modules():
         names = ACTING if hasattr(part, "get_distribution") else (*ACTING, "forward")
         for name in names if isinstance(part, BasePolicy) else ():
-            owner = next(kind for kind in type(part).__mro__ if name in vars(kind))
-            if owner.__module__.partition(".")[0] not in LIBRARIES:
+            owner = _owner(part, name)
+            if not _is_of_a_library(owner):
                 raise UnsupportedError(
                     f"{file}: the policy's class {owner.__module__}.{owner.__qualname__} has a '{name}' of its own, "
                     "which is not exported: a graph holds the networks, so put what it does into them or into the "
                     "features extractor"
                 )
+
+
+def _owner(part: Any, name: str) -> type:
+    """Return the class that a method of an object is defined in."""
+    return next(kind for kind in type(part).__mro__ if name in vars(kind))
+
+
+def _is_of_a_library(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] in LIBRARIES
 
 
 def _check_order(file: Path, layout: Layout, wrappers: Wrappers) -> None:
@@ -203,7 +214,12 @@ class Rule:
         distribution: DistributionKind | None = None
         scored_by = ""
         # MaskablePPO's policy is not an ActorCriticPolicy, but has the same parts.
-        if hasattr(policy, "action_net") and hasattr(policy, "action_dist"):
+        # What a class of the user's own does behind action_net is in the action alone.
+        if (
+            hasattr(policy, "action_net")
+            and hasattr(policy, "action_dist")
+            and all(map(_is_of_a_library, (type(policy.action_dist), *(_owner(policy, name) for name in CHOOSING))))
+        ):
             scored_by = "action_net"
             if discrete:
                 mode, names = "argmax", (ACTION_DIST_INPUTS,)

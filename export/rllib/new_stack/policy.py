@@ -561,7 +561,7 @@ def _action_rule(
             f"forward gives {', '.join(sorted(forward))}"
         )
     kind = module.get_inference_action_dist_cls()
-    mode = find_mode(_deterministic(module), kind.__name__, action_space, forward[Columns.ACTION_DIST_INPUTS])
+    mode = find_mode(_deterministic(module), (_unbound(kind),), action_space, forward[Columns.ACTION_DIST_INPUTS])
     exploring = module.get_exploration_action_dist_cls()
     distribution = None if mode == "given" else distribution_kind(_unbound(exploring))
     if distribution is None:

@@ -318,11 +318,12 @@ def _action_rule(
     plain = getattr(kind, "func", kind)  # RLlib binds the space to some of its classes
     if isinstance(policy.model, DQNTorchModel) and issubclass(plain, TorchCategorical):
         return None, "argmax", (Q_VALUES,)
+    parts = getattr(kind, "keywords", {}).get("child_distributions", ())
+    children = [getattr(part, "func", part) for part in parts]
     mode = find_mode(
-        lambda probe: kind(probe, policy.model).deterministic_sample(), plain.__name__, action_space, inputs
+        lambda probe: kind(probe, policy.model).deterministic_sample(), (plain, *children), action_space, inputs
     )
-    children = getattr(kind, "keywords", {}).get("child_distributions", ())
-    all_known = all(distribution_kind(getattr(child, "func", child)) for child in children)
+    all_known = all(map(distribution_kind, children))
     # The mode is "given" for counted integers and for the user's own distributions.
     distribution = distribution_kind(plain) if all_known and mode != "given" else None
     if distribution is None:

@@ -381,6 +381,38 @@ def test_a_policy_that_acts_outside_of_its_networks_is_refused(
         export_checkpoint(tmp_path / "model.zip", tmp_path / "out", notify=notices.append)
 
 
+class StopsForARareOne(sb3.common.policies.ActorCriticPolicy):
+    """Acts otherwise behind its networks for an observation that is no sample."""
+
+    def get_distribution(self, obs: Any) -> Any:
+        found = super().get_distribution(obs)
+        found.distribution.loc = torch.where(obs[:, :1] == 0.3, 0.1, found.distribution.loc)
+        return found
+
+
+class ChoosesOtherwise(sb3.common.distributions.DiagGaussianDistribution):
+    def mode(self) -> Any:
+        return super().mode().clamp(max=0.1)
+
+
+class HasDistribution(sb3.common.policies.ActorCriticPolicy):
+    def __init__(self, *given: Any, **settings: Any) -> None:
+        super().__init__(*given, **settings)
+        self.action_dist = ChoosesOtherwise(2)
+
+
+@pytest.mark.parametrize("policy", [StopsForARareOne, HasDistribution])
+def test_what_an_own_class_does_behind_its_networks_is_in_the_graph(
+    policy: Any, tmp_path: Path, notices: list[str]
+) -> None:
+    model = make(sb3.PPO, policy, VECTOR, BOX)
+    model.save(tmp_path / "model")
+    result = export_checkpoint(tmp_path / "model.zip", tmp_path / "out", notify=notices.append)
+    seen = samples(VECTOR, 6)
+    seen[0][0][0] = 0.3
+    same(episodes(result, seen), [model.predict(obs, deterministic=True)[0] for episode in seen for obs in episode])
+
+
 class TestBroken:
     @pytest.fixture
     def model(self, tmp_path: Path) -> Path:
