@@ -90,6 +90,14 @@ def prove(
     )
 
 
+def does_not_run(where: str, error: Exception) -> ParityError:
+    """Return the error for a graph that fails on samples."""
+    return ParityError(
+        f"{where}: the exported graph does not run: {str(error).splitlines()[0]}; as a rule it keeps the number of "
+        "observations that it was traced with, as in torch.vmap: compute all rows at once"
+    )
+
+
 def _prove_format(
     name: str,
     recipe: Recipe,
@@ -107,7 +115,7 @@ def _prove_format(
         try:
             got = next(replayed)[1]
         except Exception as error:  # a shape baked into the graph ends in onnxruntime's or torch's own exceptions
-            raise ParityError(f"{where}: the exported graph does not run: {str(error).splitlines()[0]}") from error
+            raise does_not_run(where, error) from error
         for output, expected in reference.outputs.items():
             _check_form(where, output, got.get(output), expected, recipe.action_leaves.get(output), reference.framework)
         result = comparer.compare(number, got)

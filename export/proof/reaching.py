@@ -13,8 +13,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from rlservo.errors import ParityError
-from rlservo.export.proof.parity import GraphLoop
+from rlservo.export.proof.parity import GraphLoop, does_not_run
 from rlservo.export.recipe.recipe import Recipe
 from rlservo.export.recipe.runners import Inputs, Outputs, Runner
 from rlservo.export.recipe.samples import Batch, draw_candidates
@@ -50,9 +49,7 @@ def _refusing(run: Runner) -> Runner:
             return run(inputs)
         except Exception as error:  # a shape baked into the graph ends in onnxruntime's own exceptions
             rows = len(next(iter(inputs.values())))
-            raise ParityError(
-                f"onnx, a batch of {rows} observations: the exported graph does not run: {str(error).splitlines()[0]}"
-            ) from error
+            raise does_not_run(f"onnx, a batch of {rows} observations", error) from error
 
     return run_or_refuse
 

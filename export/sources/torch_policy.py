@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from rlservo.errors import CheckpointError, UnsupportedError, first_line
-from rlservo.export.recipe.kept_values import changed, kept_values
+from rlservo.export.recipe.kept_values import HOLDERS, changed, kept_values
 from rlservo.export.recipe.recipe import Recipe, parameter_count
 from rlservo.export.recipe.runners import Inputs, Outputs
 from rlservo.export.recipe.samples import draw_pair
@@ -174,13 +174,27 @@ def second(module: nn.Module, what: str) -> nn.Module:
     try:
         copied = copy.deepcopy(module)
     except Exception as error:
-        raise UnsupportedError(f"{what}: {type(module).__name__} cannot be copied: {first_line(error)}") from error
+        raise UnsupportedError(
+            f"{what}: {_uncopied(module)} cannot be copied, and copies are what is exported and proven: "
+            f"{first_line(error)}"
+        ) from error
     if kept := changed(dict(kept_values(module)), dict(kept_values(copied))).removeprefix("."):
         raise UnsupportedError(
             f"{what}: a copy of the {type(module).__name__} has a different '{kept}', and copies are what is exported "
             "and proven: correct its __deepcopy__ or __getstate__"
         )
     return copied
+
+
+def _uncopied(module: nn.Module) -> str:
+    """Return the attribute that cannot be copied, such as a lock or a pool of threads, or else the module."""
+    for prefix, part in module.named_modules():
+        for name, value in vars(part).items():
+            try:
+                copy.deepcopy(None if name in HOLDERS else value)
+            except Exception:  # what a class raises
+                return f"its '{f'{prefix}.{name}'.lstrip('.')}' (a {type(value).__name__})"
+    return type(module).__name__
 
 
 def notify_mode(policy: TorchPolicy, module: nn.Module, notify: Notify) -> None:

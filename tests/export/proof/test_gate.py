@@ -559,6 +559,27 @@ def test_a_module_whose_sizes_an_observation_decides_is_refused_by_what_would_se
         export(Selects(), tmp_path)
 
 
+class Pools(Honest):
+    def __init__(self) -> None:
+        super().__init__()
+        self.pool = POOL
+
+
+class Maps(Honest):
+    def forward(self, obs: Tensor) -> Tensor:
+        return torch.vmap(lambda row: self.layer(row) * row.norm())(obs)
+
+
+def test_a_module_that_cannot_be_copied_is_refused_by_its_attribute(tmp_path: Path) -> None:
+    with pytest.raises(UnsupportedError, match=r"its 'pool' \(a ThreadPoolExecutor\) cannot be copied, and copies"):
+        export(Pools(), tmp_path)
+
+
+def test_a_graph_for_one_number_of_observations_is_refused_by_what_makes_it(tmp_path: Path) -> None:
+    with pytest.raises(ParityError, match=r"does not run: .* as in torch\.vmap: compute"):
+        export(Maps(), tmp_path)
+
+
 @pytest.mark.parametrize("module", [Honest(), Asserts(), Prints(), Caches()], ids=lambda module: type(module).__name__)
 def test_an_honest_module_is_exported_and_answers_as_itself(module: nn.Module, tmp_path: Path) -> None:
     result = export(module, tmp_path)
