@@ -93,6 +93,11 @@ LISTED = (
 )
 ALONE = "RLlib's own default connectors around the RLModule alone and its inference forward, exploration off"
 """The parity gate's reference where RLlib's own restore could not be repeated."""
+WHOLE = (
+    "RLlib's own connectors and inference forward of the whole RLModule (it could not be built for inference only, as "
+    "RLlib's actors build theirs), observation filter frozen, exploration off"
+)
+"""The same where the actors' module could not be built."""
 REFUSED_MODULES = {
     "DreamerV3TorchRLModule": "DreamerV3 draws its world model's state at random in every step, exploring or not, so "
     "no single action can prove an export",
@@ -269,6 +274,8 @@ def restore_new_stack(files: CheckpointFiles, notify: Callable[[str], None], *, 
     forward = _forward_once(pipelines, draft)
     build = partial(build_actor, config, module, None if slot is SINGLE_AGENT else slot.module, own[0])
     actor = _actor(files, module, build if config is not None else lambda: None, notify)
+    if actor is None:
+        actor, how = module, "; ".join(filter(None, (WHOLE, how)))
     acting = pipelines_of(slot, actor, env_to_module, module_to_env, observation_space, action_space)
     is_repeatable = _acts_alike(forward, _forward_once(pipelines, draft))  # else the gate says so
     if is_repeatable and not _acts_alike(forward, _forward_once(acting, draft)):
@@ -383,11 +390,13 @@ def _read_pipelines(
     return pipelines
 
 
-def _actor(files: CheckpointFiles, module: Any, build: Callable[[], Any | None], notify: Callable[[str], None]) -> Any:
+def _actor(
+    files: CheckpointFiles, module: Any, build: Callable[[], Any | None], notify: Callable[[str], None]
+) -> Any | None:
     """Return the module as RLlib's actors build it: for inference only, and from the configuration, as `build` does.
 
     RLlib saves a module's arguments as it finds them in its attributes, and does not restore by them. The actor gets
-    all weights: a critic's memory, which it may have, is compared too.
+    all weights: a critic's memory, which it may have, is compared too. None if it cannot be built.
     """
     if files.alone or is_older(files.module):
         return module
@@ -402,7 +411,7 @@ def _actor(files: CheckpointFiles, module: Any, build: Callable[[], Any | None],
             f"module {type(module).__name__} cannot be built for inference only, as RLlib's actors build it "
             f"({first_line(error)}): the actions are those of the whole module"
         )
-        return module
+        return None
     return actor.eval().requires_grad_(False)
 
 

@@ -21,6 +21,7 @@ from rlservo.export.export_checkpoint import ExportResult, export_all_modules, e
 from rlservo.export.prune_checkpoint import prune_checkpoint
 from rlservo.export.recipe.recipe import Recipe, StateLeaf
 from rlservo.export.recipe.samples import draw_batches
+from rlservo.export.rllib.new_stack import policy as new_stack
 from rlservo.export.verify_bundle import verify_bundle
 from rlservo.policy.policy import Policy
 
@@ -80,6 +81,18 @@ def test_a_module_that_acts_otherwise_in_rllibs_actors_is_refused(
     prune_checkpoint(reported_zoo / name, tmp_path / "pruned", app_dir=app, notify=lambda _: None)
     with pytest.raises(UnsupportedError, match=f"{kind} acts differently"):
         export_checkpoint(tmp_path / "pruned", tmp_path / "out", name="arm", app_dir=app, notify=lambda _: None)
+
+
+def test_the_contract_says_that_the_actors_module_could_not_be_built(
+    export: Callable[..., ExportResult], monkeypatch: pytest.MonkeyPatch, notices: list[str]
+) -> None:
+    def fail(*_: Any) -> Any:
+        raise ValueError("no such file")
+
+    monkeypatch.setattr(new_stack, "build_actor", fail)
+    reference = export("critic_in_training").contract.parity.reference
+    assert "the whole RLModule (it could not be built for inference only, as RLlib's actors" in reference
+    assert "as RLlib's actors build it (no such file)" in " ".join(notices)
 
 
 def test_a_network_that_reads_parts_in_their_order_is_given_rllibs(
