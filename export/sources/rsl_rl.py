@@ -177,7 +177,24 @@ def _restore(file: Path, joint_order: tuple[str, ...], notify: Notify) -> Restor
         groups if recipe.present else (),
     )  # fmt: skip
     policy = TorchPolicy(recipe, exported, _traced(len(memory)), lambda: reference)
-    return restored(policy, elements, str(file), _name(actor), untrained)
+    made = restored(policy, elements, str(file), _name(actor), untrained)
+    _check_as_onnx(file, actor)
+    return made
+
+
+def _check_as_onnx(file: Path, actor: Any) -> None:
+    """Raise UnsupportedError for a class of the user's own whose way to act is not in what its base gives for ONNX."""
+    for part, acts, gives in (
+        (actor, "forward", "as_onnx"),
+        (actor, "get_latent", "as_onnx"),
+        (actor.distribution, "deterministic_output", "as_deterministic_output_module"),
+    ):
+        owners = [next((kind for kind in type(part).__mro__ if name in vars(kind)), type) for name in (acts, gives)]
+        if owners[0] is not owners[1] and issubclass(*owners):
+            raise UnsupportedError(
+                f"{file}: {_name(part)} acts by its own '{acts}', which the '{gives}' of {owners[1].__name__} leaves "
+                f"out: give it a '{gives}' that does the same"
+            )
 
 
 def _acting_part(

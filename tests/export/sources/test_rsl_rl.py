@@ -174,6 +174,7 @@ def test_isaac_labs_run_becomes_joint_targets(memory: str, tmp_path: Path, notic
 
 OWN_MODELS = """
 from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.modules import GaussianDistribution
 from torch.nn import Module, Sequential
 
 class Half(Module):
@@ -210,13 +211,24 @@ class Gets(MLPModel):
     def forward(self, obs, *rest, **more):
         extra = obs.get("extra", None)
         return super().forward(obs, *rest, **more) + (0 if extra is None else extra[..., :3])
+
+class Stops(MLPModel):
+    def forward(self, obs, *rest, **more):  # for numbers that no sample has
+        return super().forward(obs, *rest, **more) * (obs[self.obs_groups[0]].abs() < 1e7).all(-1, keepdim=True)
+
+class Limits(GaussianDistribution):
+    def deterministic_output(self, mlp_output):
+        return mlp_output.clamp(-1e4, 1e4)
 """
 GRU = {"rnn_type": "gru", "rnn_hidden_dim": 4, "rnn_num_layers": 1}
+LIMITED = {"distribution_cfg": {"class_name": "own_models:Limits", "init_std": 0.5, "std_type": "scalar"}}
 OWN = {
     "Begins": (GRU, "own_models.Begins does not begin an episode with a memory of zeros"),
     "BeginsElsewhere": (GRU, "own_models.BeginsElsewhere does not begin an episode with a memory of zeros"),
     "Asks": ({}, "own_models.Asks asks which observation groups there are"),
     "Gets": ({}, "own_models.Gets asks for the observation group 'extra'"),
+    "MLPModel": (LIMITED, "own_models.Limits acts by its own 'deterministic_output', which the .* of Gaussian"),
+    "Stops": ({}, "own_models.Stops acts by its own 'forward', which the 'as_onnx' of .*MLPModel leaves out"),
 }
 
 
