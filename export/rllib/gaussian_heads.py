@@ -55,7 +55,7 @@ def replace_heads(module: nn.Module) -> None:
 
 
 def _lean(head: Any) -> nn.Module | None:
-    kind = type(head).__name__
+    kind = type(head).__name__ if type(head).__module__.startswith("ray.rllib.") else ""
     if kind == "TorchMLPHead" and head.clip_log_std:
         width = [layer for layer in head.net.modules() if isinstance(layer, nn.Linear)][-1].out_features // 2
         return GaussianHead(head.net, width, float(head.log_std_clip_param_const))

@@ -103,6 +103,7 @@ REFUSED_MODULES = {
     "no single action can prove an export",
 }
 """Modules of RLlib's own that can be restored and not exported, and why."""
+ACTING = ("forward_inference", "_forward_inference", "_forward")
 AGENT_STEPS = 16  # observations for which agents of one module are compared
 QF_PREDS = "qf_preds"  # DQN's key for the Q-values, in ray/rllib/algorithms/dqn/default_dqn_rl_module.py
 
@@ -559,7 +560,7 @@ def _action_rule(
     """Return the distribution's kind, how its mode is computed and the outputs' names, by asking the class."""
     name = type(module).__name__
     has_q_values = isinstance(module, QNetAPI)  # SAC's module has them as well, but gives a distribution
-    if has_q_values and Columns.ACTION_DIST_INPUTS not in forward:
+    if has_q_values and Columns.ACTION_DIST_INPUTS not in forward and _acts_by_rllib(module):
         return None, "argmax", (Q_VALUES,)
     if Columns.ACTIONS in forward:
         notify(f"module {name} computes its actions itself: the export does the same, and cannot explore")
@@ -576,6 +577,12 @@ def _action_rule(
     if distribution is None:
         notify(f"the action distribution {exploring.__name__} is not one of RLlib's: the export cannot explore with it")
     return distribution, mode, (Columns.ACTION_DIST_INPUTS,)
+
+
+def _acts_by_rllib(module: Any) -> bool:
+    """Return whether no class of the user's own chooses the action."""
+    owners = [next(kind for kind in type(module).__mro__ if name in vars(kind)) for name in ACTING]
+    return all(owner.__module__.startswith("ray.rllib.") for owner in owners)
 
 
 def _deterministic(module: Any) -> Callable[[Tensor], Tree]:
