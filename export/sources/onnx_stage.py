@@ -70,6 +70,8 @@ def _expand(_: Attributes, x: Tensor, shape: Any) -> Tensor:
 def _gather(a: Attributes, x: Tensor, places: Any) -> Tensor:
     axis = a.get("axis", 0) % x.dim()
     if not places.ndim:
+        if isinstance(places, Tensor):  # computed from the observation
+            return x.index_select(axis, places.reshape(1)).squeeze(axis)
         return x.select(axis, int(places))
     chosen = (*[slice(None)] * axis, _tensor(places))
     return x[chosen]
@@ -291,6 +293,10 @@ def _run(
     kind: str, attributes: Attributes, values: Mapping[str, Any], inputs: list[str], outputs: list[str]
 ) -> dict[str, Any]:
     first, *rest = (values[name] for name in inputs)
+    if kind in TAKE_NUMBERS - {"Gather"} and any(isinstance(one, Tensor) for one in rest):
+        raise UnsupportedError(
+            f"{kind} '{outputs[0]}' takes a size or an axis that depends on the observation: take fixed ones"
+        )
     operands = [_tensor(first), *(rest if kind in TAKE_NUMBERS else map(_tensor, rest))]
     result = PLAIN[kind](*operands) if kind in PLAIN else OPERATORS[kind](attributes, *operands)
     return dict(zip(outputs, result if isinstance(result, tuple) else (result,), strict=False))

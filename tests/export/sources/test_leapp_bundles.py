@@ -328,6 +328,40 @@ def test_a_custom_operator_is_refused_by_its_domain_and_name(tmp_path: Path) -> 
         OnnxStage(tmp_path / "stage.onnx")
 
 
+def stage(folder: Path, node: Any, size: int) -> Any:
+    """Return a stage in which `node` gives y and takes `at`, which is 1 for numbers above 1e7 in x and else 0."""
+    from rlservo.export.sources.onnx_stage import OnnxStage
+
+    make, kinds = onnx.helper, onnx.TensorProto
+    nodes = [
+        make.make_node("ReduceMax", ["x"], ["most"], keepdims=int(node.op_type == "Slice"), axes=[0]),
+        make.make_node("Greater", ["most", "limit"], ["is_far"]),
+        make.make_node("Cast", ["is_far"], ["at"], to=kinds.INT64),
+        node,
+    ]
+    x, y = (make.make_tensor_value_info(name, kinds.FLOAT, [n]) for name, n in (("x", 4), ("y", size)))
+    kept = [onnx.numpy_helper.from_array(values, name) for values, name in (
+        (np.float32(1e7).reshape(()), "limit"), (np.float32([[1, 2, 3], [4, 5, 6]]), "table"), (np.array([4]), "end"),
+    )]  # fmt: skip
+    onnx.save(make.make_model(make.make_graph(nodes, "stage", [x], [y], kept)), str(folder / "stage.onnx"))
+    return OnnxStage(folder / "stage.onnx")
+
+
+def test_a_row_that_the_observation_chooses_is_not_frozen_in_a_trace(tmp_path: Path) -> None:
+    gather = stage(tmp_path, onnx.helper.make_node("Gather", ["table", "at"], ["y"], axis=0), 3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's, about torch.jit
+        traced = torch.jit.trace(gather, (torch.zeros(4),))
+    for x, wanted in ((torch.zeros(4), [1.0, 2.0, 3.0]), (torch.full((4,), 1e8), [4.0, 5.0, 6.0])):
+        np.testing.assert_array_equal(traced(x)[0].numpy(), wanted)
+
+
+def test_a_size_that_the_observation_decides_is_refused_by_its_operator(tmp_path: Path) -> None:
+    cut = stage(tmp_path, onnx.helper.make_node("Slice", ["x", "at", "end"], ["y"]), 4)
+    with pytest.raises(UnsupportedError, match="Slice 'y' takes a size or an axis that depends on the observation"):
+        cut(torch.zeros(4))
+
+
 @pytest.mark.parametrize("bidirectional", [False, True])
 @pytest.mark.parametrize("kind", ["LSTM", "GRU"])
 def test_recurrent_operators_give_what_onnxruntime_gives(kind: str, bidirectional: bool, tmp_path: Path) -> None:
