@@ -27,9 +27,9 @@ def contract_report(contract: Contract) -> RenderableType:
     """Return the whole contract as text: inputs, baked-in steps, outputs and proof."""
     parts: list[RenderableType] = [
         _summary(contract),
-        *_space_tables("Goes in: observation", "obs", contract.observation_space, _filter(contract)),
+        *_space_tables("Goes in: observation", "obs", contract.observation_space, _filters(contract)),
         _baked_table(contract.baked_in),
-        *_space_tables("Comes out: action", "action", contract.action_space, None),
+        *_space_tables("Comes out: action", "action", contract.action_space, {}),
         *([_state_table(contract.state)] if contract.state else []),
         _tensor_table(contract),
         _proof(contract.parity),
@@ -121,14 +121,14 @@ def _exploration(contract: Contract) -> str:
     return f"sampling a {kind}{transform[contract.distribution.transform]}"
 
 
-def _space_tables(title: str, root: str, space: SpaceSpec, frozen: BakedStep | None) -> list[RenderableType]:
+def _space_tables(title: str, root: str, space: SpaceSpec, filters: Mapping[str, BakedStep]) -> list[RenderableType]:
     """Return one table of all leaves, then one of the elements of each leaf with more than bounds."""
     leaves = leaf_specs(space, root)
-    detailed = [name for name, leaf in leaves.items() if leaf.elements or _seen(frozen, leaf.size)[0]]
+    detailed = [name for name, leaf in leaves.items() if leaf.elements or _seen(filters.get(name), leaf.size)[0]]
     parts: list[RenderableType] = []
     if len(leaves) > 1 or not detailed:
         parts.append(_overview(title if len(leaves) == 1 else f"{title}, in {len(leaves)} parts", leaves))
-    parts += [_elements(title if len(leaves) == 1 else name, leaves[name], frozen) for name in detailed]
+    parts += [_elements(title if len(leaves) == 1 else name, leaves[name], filters.get(name)) for name in detailed]
     return parts
 
 
@@ -202,10 +202,10 @@ def _shown(size: int) -> list[int | None]:
     return [*range(ENDS), None, *range(size - ENDS, size)]
 
 
-def _filter(contract: Contract) -> BakedStep | None:
-    """Return the filter if it applies to the observation itself, not to another step's output."""
+def _filters(contract: Contract) -> dict[str, BakedStep]:
+    """Return the filter of each tensor, if it applies to the observation itself, not to another step's output."""
     before = itertools.takewhile(lambda step: step.step not in CHANGING, contract.baked_in)
-    return next((step for step in before if step.step == "mean_std_filter"), None)
+    return {str(step.values.get("leaf", "obs")): step for step in before if step.step == "mean_std_filter"}
 
 
 def _seen(frozen: BakedStep | None, size: int) -> tuple[Sequence[Any], Sequence[Any]]:

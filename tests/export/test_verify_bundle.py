@@ -17,7 +17,7 @@ from rich.console import Console
 
 from checkpoints import training_code
 from rlservo.bundle.bundle import load_bundle, read_contract, write_contract
-from rlservo.bundle.spaces import BoxSpec, Element, leaf_specs
+from rlservo.bundle.spaces import BoxSpec, DictSpec, Element, leaf_specs
 from rlservo.errors import BundleError, ParityError, UsageError
 from rlservo.export.element_names import read_elements
 from rlservo.export.export_checkpoint import ExportResult, export_checkpoint
@@ -306,6 +306,24 @@ def test_long_element_names_with_units_and_a_filter_fit_eighty_columns(
     for index, one in enumerate(ROBOT_NAMES):
         assert [str(index), one, "rad/s", "-6.283", "6.283", "-123.5", "0.001234"] in rows
     assert max(len(line.rstrip()) for line in shown.splitlines()) <= 80
+
+
+def test_each_part_of_a_dict_shows_the_numbers_of_its_own_filter(
+    zoo: Path, exported: Callable[..., ExportResult]
+) -> None:
+    contract = exported(zoo / "pendulum").contract
+    box = BoxSpec(shape=(1,), dtype="float32", low=-1.0, high=1.0)
+    step = contract.baked_in[0]
+    filters = [
+        step.model_copy(update={"values": {"mean": [mean], "std": [0.5], "leaf": f"obs.{part}"}})
+        for part, mean in (("arm", 0.125), ("goal", 0.875))
+    ]
+    space = DictSpec(spaces={"arm": box, "goal": box})
+    file = io.StringIO()
+    changed = contract.model_copy(update={"observation_space": space, "baked_in": tuple(filters)})
+    Console(width=80, file=file).print(contract_report(changed))
+    rows = [line.split() for line in file.getvalue().splitlines()]
+    assert ["0", "-1", "1", "0.125", "0.5"] in rows and ["0", "-1", "1", "0.875", "0.5"] in rows
 
 
 def test_verify_looks_for_bounds_that_samples_seldom_reach(tmp_path: Path, notices: list[str]) -> None:
