@@ -53,15 +53,12 @@ def check_fit(contract: Contract, env: gym.Env[Any, Any], arguments: Mapping[str
         ("action", contract.action_space, env.action_space),
     )
     for side, expected, actual in sides:
-        theirs = _described(description.get(side), expected.size)
-        difference = _difference(expected, actual, bounds=False)
-        if not difference and len(theirs) == len(expected.elements):
-            difference = _contradiction(expected.elements, theirs)
+        difference = _difference(expected, actual, bounds=False) or _contradiction(expected, description.get(side))
         if difference := difference or _difference(expected, actual, bounds=side == "action"):
             name = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
             raise UsageError(f"policy {contract.name!r} does not fit {name}: the {side} {difference}")
         if is_real:
-            check_complete(contract, side, expected.elements, theirs)
+            check_complete(contract, side, expected.elements, _described(description.get(side), expected.size))
 
 
 def check_complete(contract: Contract, side: str, ours: Sequence[Element], theirs: Sequence[Element]) -> None:
@@ -123,9 +120,7 @@ def _nested_difference(expected: DictSpec | TupleSpec, actual: gym.Space[Any], *
     kind = spaces.Dict if isinstance(expected, DictSpec) else spaces.Tuple
     if not isinstance(actual, kind):
         return f"is a {type(actual).__name__} there, but the policy has a {kind.__name__}"
-    ours: dict[Any, SpaceSpec] = (
-        dict(expected.spaces) if isinstance(expected, DictSpec) else dict(enumerate(expected.spaces))
-    )
+    ours = _parts(expected.spaces)
     theirs: dict[Any, Any] = dict(actual.spaces) if isinstance(actual, spaces.Dict) else dict(enumerate(actual.spaces))
     if set(ours) != set(theirs):
         return f"has the parts {sorted(map(str, theirs))} there, but the policy has {sorted(map(str, ours))}"
@@ -135,9 +130,19 @@ def _nested_difference(expected: DictSpec | TupleSpec, actual: gym.Space[Any], *
     return None
 
 
-def _contradiction(ours: Sequence[Element], theirs: Sequence[Element]) -> str | None:
-    found = contradiction(ours, theirs)
+def _contradiction(expected: SpaceSpec, described: Any) -> str | None:
+    """Return what an environment's description, which has the form of its space, says otherwise than the policy."""
+    if isinstance(expected, DictSpec | TupleSpec):
+        theirs = _parts(described) if isinstance(described, Mapping | Sequence) else {}
+        found_in = ((key, _contradiction(child, theirs.get(key))) for key, child in _parts(expected.spaces).items())
+        return next((f"part {key} {difference}" for key, difference in found_in if difference), None)
+    elements = _described(described, expected.size)
+    found = contradiction(expected.elements, elements) if len(elements) == len(expected.elements) else None
     return found and f"{found[0]} {found[2]} there, but the policy has {found[1]}"
+
+
+def _parts(nested: Mapping[Any, Any] | Sequence[Any]) -> Mapping[Any, Any]:
+    return nested if isinstance(nested, Mapping) else dict(enumerate(nested))
 
 
 def _described(elements: Any, size: int) -> tuple[Element, ...]:
