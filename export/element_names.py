@@ -122,6 +122,11 @@ def described_by(
     Raises UsageError if it does not describe them, or contradicts the checkpoint.
     """
     problems: list[str] = []
+    try:
+        _env_class(env_id)
+    except (Exception, SystemExit) as error:  # importing runs the user's own code
+        hint = ": give its folder with --app-dir" if isinstance(error, ModuleNotFoundError) else ""
+        raise UsageError(f"--env {env_id} cannot be found: {first_line(error)}{hint}") from error
     described = read_elements(env_id, env_config, recipe, problems.append)
     if problems or not (described.observation or described.action):
         raise UsageError(f"--env {env_id}: {problems[0] if problems else 'it has no describe() that names elements'}")

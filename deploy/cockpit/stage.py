@@ -56,11 +56,14 @@ class Stage:
         `unproven`: a real robot takes any policy.
         """
         self.env_id, self.arguments = env_id, dict(arguments)
+        foreign = f"the cockpit draws only rlservo's own simulators (rlservo/...): {env_id} is not one of them"
+        if f"{NAMESPACE}/" not in env_id:  # its module may be elsewhere, and the cockpit has no --app-dir
+            raise UsageError(foreign)
         self._made = make_env(env_id, self.arguments, render=False)
         env = self._made.unwrapped
         if not isinstance(env, RenderedEnv):
             self._made.close()
-            raise UsageError(f"the cockpit draws rlservo's own simulators (rlservo/...): {env_id} is not one of them")
+            raise UsageError(foreign)
         self.env = env
         self._bodies = moving_bodies(env.model)
         self._disturbed: DomainRandomization = DomainRandomization(self._made)
@@ -140,8 +143,9 @@ def home_of(contract: Contract) -> str:
     env_id = trained.env_id and wrapped_env(trained.env_id, trained.env_config)[0]
     if env_id is None or not env_id.startswith(f"{NAMESPACE}/"):
         raise UsageError(
-            f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, which the cockpit "
-            f"cannot draw: choose a matching simulator of rlservo with --env"
+            f"policy '{contract.name}' was trained in {env_id or 'an environment it does not name'}, but the cockpit "
+            "draws only rlservo's simulators: choose a matching one with --env, or use 'rlservo log plot' or "
+            "'rollout --video'"
         )
     return env_id
 

@@ -109,9 +109,9 @@ def _call(method: Callable[..., Any], index: int, step: int, *arguments: Any, **
     except Exception as error:  # an environment is third-party code
         if getattr(error, "ends_run", False):  # a real robot that waits for a person
             raise StoppedError(f"episode {index}, step {step}: {error}") from error
-        raise UsageError(
-            f"episode {index}, step {step}: the environment failed with {type(error).__name__}: {error}"
-        ) from error
+        is_ours = type(error).__module__.startswith("rlservo.")  # whose sentences stand alone
+        reason = str(error) if is_ours else f"the environment failed with {type(error).__name__}: {error}"
+        raise UsageError(f"episode {index}, step {step}: {reason}") from error
 
 
 def _command(action: Any) -> Any:

@@ -24,10 +24,13 @@ def make_env(env_id: str, arguments: Mapping[str, Any], *, render: bool) -> gym.
         return gym.make(importing_id(env_id), disable_env_checker=True, **{**arguments, **mode})
     except gym.error.UnregisteredEnv as error:
         close = difflib.get_close_matches(env_id, list(gym.registry), n=3, cutoff=0.5)
-        hint = f"did you mean {' or '.join(close)}?" if close else "write 'module:Id' to import the module that has it"
+        hint = f"did you mean {' or '.join(close)}?" if close else ""
+        if not env_id.startswith("rlservo/") and ":" not in env_id:
+            hint = f"{hint} Your own is 'module:{env_id}', with the module that registers it".lstrip()
         raise UsageError(f"environment {env_id!r} is not registered: {hint}", {"close_matches": close}) from error
     except (ModuleNotFoundError, gym.error.DependencyNotInstalled) as error:
         hint = install("sim") if env_id.startswith("rlservo/") else "install it, or name its folder with --app-dir"
-        raise UsageError(f"environment {env_id!r} cannot be made: {error}: {hint}") from error
+        raise UsageError(f"environment {env_id!r} cannot be made: {error.__cause__ or error}: {hint}") from error
     except Exception as error:  # a constructor is third-party code
-        raise UsageError(f"environment {env_id!r} cannot be made with {arguments}: {error}") from error
+        reason = str(error).partition(" was raised from the environment creator")[0]  # Gymnasium repeats the call
+        raise UsageError(f"environment {env_id!r} cannot be made with {arguments}: {reason}") from error

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rlservo.errors import UsageError
+from rlservo.errors import UsageError, first_line
 from rlservo.extras import needs_extra
 from rlservo.policy.acting_policy import Closeable
 
@@ -42,7 +42,10 @@ class VideoFile(Closeable):
 
             # macro_block_size 2: yuv420p needs it; the default of 16 would rescale most pictures with a warning.
             self._writer = imageio.get_writer(self.path, fps=self._fps, codec="libx264", macro_block_size=2)
-        self._writer.append_data(frame)
+        try:
+            self._writer.append_data(frame)
+        except OSError as error:  # the encoder ended; it has written why, such as a full disk, to standard error
+            raise UsageError(f"the video {self.path} cannot be written: {first_line(error)}") from error
         self.frames += 1
 
     def close(self) -> None:

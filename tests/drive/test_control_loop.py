@@ -20,8 +20,9 @@ from rich.console import Console
 from typing_extensions import Self
 
 from rlservo.bundle.contract import Contract, Evaluation, Parity, Provenance, TensorSpec
-from rlservo.bundle.spaces import BoxSpec, DiscreteSpec
+from rlservo.bundle.spaces import BoxSpec, DictSpec, DiscreteSpec, Element
 from rlservo.drive.control_loop import rollout
+from rlservo.drive.environment_fit import check_fit
 from rlservo.drive.report import latency_of, render_report
 from rlservo.drive.success import success_of, wilson_interval
 from rlservo.errors import UnavailableError, UsageError
@@ -350,14 +351,49 @@ def test_an_observation_space_that_differs_is_refused() -> None:
         rollout(WrittenPolicy(contract, lambda _: 0), CORRIDOR, episodes=1)
 
 
+class Parts(Corridor):
+    """A corridor whose observation is a Dict, described by a dict of lists."""
+
+    observation_space = gym.spaces.Dict({"walker": gym.spaces.Box(-10, 10, (1,), np.float32)})
+
+    def __init__(self, **_: Any) -> None:
+        super().__init__()
+        self.observation_space = Parts.observation_space
+
+    @classmethod
+    def describe(cls, **_: Any) -> dict[str, Any]:
+        return {**super().describe(), "observation": {"walker": [{"name": "x", "unit": "m"}]}}
+
+
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_a_described_dict_is_compared_part_by_part(unit: str, caplog: pytest.LogCaptureFixture) -> None:
+    leaf = BoxSpec(shape=(1,), dtype="float32", low=-10, high=10, elements=(Element(name="x", unit=unit),))
+    spec = DictSpec(spaces={"walker": leaf})
+    contract = corridor_policy().contract.model_copy(update={"observation_space": spec})
+    env = Parts()
+    if unit == "m":
+        check_fit(contract, env, {})
+    else:
+        with pytest.raises(UsageError, match=r"part walker element 0 \(x\) has unit m there, but the policy has mm"):
+            check_fit(contract, env, {})
+    env.close()
+    assert not caplog.records  # "describe() is not used"
+
+
 def test_an_unknown_environment_is_named_with_its_close_matches() -> None:
     with pytest.raises(UsageError, match=r"'Pendulun-v1' is not registered: did you mean Pendulum-v1") as caught:
         rollout(pendulum_policy(), "Pendulun-v1", episodes=1)
     assert "Pendulum-v1" in caught.value.details["close_matches"]
+    assert "Your own is 'module:Pendulun-v1'" in str(caught.value)
+
+
+def test_a_module_that_is_elsewhere_asks_for_its_folder() -> None:
+    with pytest.raises(UsageError, match=r"cannot be made: No module named 'crane': install it, or name its folder"):
+        rollout(corridor_policy(), "crane:Crane-v0", episodes=1)
 
 
 def test_wrong_constructor_arguments_are_a_usage_error() -> None:
-    with pytest.raises(UsageError, match="cannot be made with"):
+    with pytest.raises(UsageError, match=r"cannot be made with .*unexpected keyword argument 'colour'$"):
         rollout(corridor_policy(), CORRIDOR, episodes=1, env_kwargs={"colour": "red"})
 
 
@@ -478,6 +514,7 @@ import numpy as np
 from test_control_loop import WrittenPolicy, contract_of
 from rlservo.bundle.spaces import BoxSpec
 from rlservo.drive.control_loop import rollout
+from rlservo.drive.environment_fit import check_fit
 obs = BoxSpec(shape=(27,), dtype="float32", low=None, high=None)
 action = BoxSpec(shape=(5,), dtype="float32", low=-1.0, high=1.0)
 def five_steps(obs):  # a frame takes a quarter of a second without a graphics card

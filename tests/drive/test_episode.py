@@ -11,6 +11,7 @@ import pytest
 from rlservo.bundle.contract import REWARD, Contract, TensorSpec
 from rlservo.drive.driven_episode import DrivenEpisode, run_episode
 from rlservo.errors import ActionError, UsageError
+from rlservo.robots.argument_checks import InvalidResetError
 
 
 class Countdown:
@@ -93,6 +94,8 @@ def test_errors_name_episode_and_step_and_stay_what_they_are() -> None:
     assert caught.value is error and error.details == {"element": [0]}
     with pytest.raises(UsageError, match="episode 0, step 0: the environment failed with OSError: the floor gave way"):
         run_episode(Countdown(OSError), Chooser(), index=0, seed=0)
+    with pytest.raises(UsageError, match=r"^episode 0, step 0: the floor gave way$"):
+        run_episode(Countdown(InvalidResetError), Chooser(), index=0, seed=0)
 
 
 def test_return_is_gymnasiums_own_sum() -> None:

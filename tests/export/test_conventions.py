@@ -75,6 +75,8 @@ def test_environment_that_contradicts_or_is_not_understood_is_refused(
         described_by(env_id(quantity), {}, checkpoint, RECIPE)
     with pytest.raises(UsageError, match="--env CartPole-v1: it has no describe"):
         described_by("CartPole-v1", {}, checkpoint, RECIPE)
+    with pytest.raises(UsageError, match="--env crane:Crane-v0 cannot be found: No module named 'crane': give"):
+        described_by("crane:Crane-v0", {}, checkpoint, RECIPE)
 
 
 def test_convention_that_no_element_needs_is_refused() -> None:

@@ -82,6 +82,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(shipped: Path, tmp_path: Path
         ((), "expected one of --url"),
         (("--bundle", bundle, "--url", "http://127.0.0.1:1"), "expected one of --url"),
         (("--bundle", bundle, "--env", "rlservo/Nothing-v0"), "'rlservo/Nothing-v0' is not registered"),
+        (("--bundle", bundle, "--env", "crane:Crane-v0"), "draws only rlservo's own simulators"),
         (("--bundle", bundle, "--env", "rlservo/NoObstacleNavigationMir100Sim-v0"), "does not fit"),
         (("--bundle", bundle, "--env-arg", "ur_model=ur7"), "'ur7' does not exist"),
         (("--bundle", bundle, "--policy", "nobody"), "there is no policy 'nobody'"),
