@@ -158,8 +158,12 @@ def find_statistics(model: Path, data: Mapping[str, Any], given: Path | None, no
             "vecnormalize.pkl; give the file that VecNormalize.save wrote with --vecnormalize, or --vecnormalize none "
             "if only rewards were normalized"
         )
-    unknown = ", which an off-policy model does not record" if "replay_buffer_class" in data else ""
-    notify(f"no vecnormalize.pkl beside the model: it is exported as trained without VecNormalize{unknown}")
+    # Nor does the proof show it: its reference has no statistics either.
+    unsure = ": an off-policy model does not record it, so if it was trained with VecNormalize, give --vecnormalize"
+    notify(
+        "no vecnormalize.pkl beside the model: it is exported as trained without VecNormalize"
+        f"{unsure if 'replay_buffer_class' in data else ''}"
+    )
     return None
 
 
