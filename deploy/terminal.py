@@ -5,6 +5,7 @@ Importing rich takes as long as everything else that `rlservo --help` needs.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -24,6 +25,8 @@ SAID_AFTER_S = 10.0
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document for programs.")]
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console
 
 
@@ -137,6 +140,17 @@ def _ends_handled_by(handler: Callable[[int, object], None]) -> Iterator[None]:
     finally:
         for number, handler_before in before.items():
             signal.signal(number, handler_before)
+
+
+@contextmanager
+def writing(place: str | Path) -> Iterator[None]:
+    """Name the place in the error of a full or read-only disk, which names no file, or a temporary one."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS):
+            raise
+        raise OSError(error.errno, os.strerror(error.errno), str(place)) from error
 
 
 def show(line: str) -> None:

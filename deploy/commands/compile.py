@@ -33,7 +33,7 @@ def compile(
         from rlservo.export.compiled.compile import compile_bundle
 
     chosen = bundle_of(bundle, version)
-    with terminal.status("importing") as show, terminal.ends_like_ctrl_c():
+    with terminal.status("importing") as show, terminal.ends_like_ctrl_c(), terminal.writing(out):
         made = compile_bundle(chosen, out, compiler=cc, progress=show)
     if as_json:
         print_json({"path": str(made.folder), **made.about})

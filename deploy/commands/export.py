@@ -134,7 +134,7 @@ def export(
         raise UsageError("--env-arg needs --env")
     conventions = dict(_pair("--convention", text, "quaternion=xyzw") for text in convention or ())
     outputs = dict(_pair("--output", text, "h_out=h_in") for text in output or ())
-    with terminal.status("importing") as show, ExitStack() as fetching:
+    with terminal.status("importing") as show, terminal.writing(out), ExitStack() as fetching:
         with needs_extra("train", "gymnasium"):
             from rlservo.export.rllib import quick_import
 

@@ -68,16 +68,17 @@ def export(
         from rlservo.recording.reader import Recording
 
     recording = Recording(files)
-    if to is Format.parquet:
-        line = f"written {out}: {export_parquet(recording, out, name=policy)} decisions"
-    elif to is Format.lerobot:
-        episodes, frames = export_lerobot(recording, out, name=policy, task=task)
-        line = f"written {out}: {episodes} episodes, {frames} frames"
-    else:
-        identity, episodes, env = export_minari(recording, out, name=policy)
-        made_in = f"of {env}" if env else "without an installed environment"
-        place = f"{PATH_VARIABLE}={shlex.quote(str(out.resolve()))}"
-        line = f"written {out}: {episodes} episodes {made_in}; {place}, then minari.load_dataset({identity!r})"
+    with terminal.writing(out):
+        if to is Format.parquet:
+            line = f"written {out}: {export_parquet(recording, out, name=policy)} decisions"
+        elif to is Format.lerobot:
+            episodes, frames = export_lerobot(recording, out, name=policy, task=task)
+            line = f"written {out}: {episodes} episodes, {frames} frames"
+        else:
+            identity, episodes, env = export_minari(recording, out, name=policy)
+            made_in = f"of {env}" if env else "without an installed environment"
+            place = f"{PATH_VARIABLE}={shlex.quote(str(out.resolve()))}"
+            line = f"written {out}: {episodes} episodes {made_in}; {place}, then minari.load_dataset({identity!r})"
     _line(line)
 
 
@@ -95,7 +96,8 @@ def repair(
     with needs_extra("record"):
         from rlservo.recording.repair import repair_recording
 
-    facts = repair_recording(file, out)
+    with terminal.writing(out):
+        facts = repair_recording(file, out)
     _line(f"written {out}: {facts.messages} messages{f'; {file} is {facts.damage}' if facts.damage else ''}")
 
 
@@ -119,7 +121,8 @@ def plot(
         from rlservo.recording.plot import plot_episode
         from rlservo.recording.reader import Recording
 
-    drawn = plot_episode(Recording(files), episode, out, name=policy)
+    with terminal.writing(out):
+        drawn = plot_episode(Recording(files), episode, out, name=policy)
     terminal.output().print(f"written {out}: {len(drawn)} decisions", markup=False, highlight=False, soft_wrap=True)
 
 

@@ -30,7 +30,7 @@ def page(
 
     folders = sorted({folder.parent for folder in find_bundles(bundle)})
     chosen = [bundle_of(bundle if len(folders) == 1 else folder, version) for folder in folders]
-    with terminal.status("reading") as show, terminal.ends_like_ctrl_c():
+    with terminal.status("reading") as show, terminal.ends_like_ctrl_c(), terminal.writing(out):
         sizes = write_site(chosen, out, show)
     names = ", ".join(folder.parent.name for folder in chosen)
     line = f"written   {out / 'index.html'}: {names}; {sum(sizes.values()) / 1e6:.1f} MB"

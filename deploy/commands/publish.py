@@ -44,7 +44,7 @@ def publish(
     from rlservo.serve_app.repository.signature import SIGNATURE_FILE
 
     chosen = load_bundle(bundle_of(bundle, None))
-    with tempfile.TemporaryDirectory(prefix="rlservo-publish-") as folder:
+    with terminal.writing(uri), tempfile.TemporaryDirectory(prefix="rlservo-publish-") as folder:
         if version == "next":
             version = next_version(uri, chosen.contract.name)
         if version not in (None, chosen.contract.version):

@@ -36,6 +36,7 @@ def sign(
     from rlservo.serve_app.repository.signature import sign as sign_bundle
 
     contents = load_bundle(bundle_of(bundle, version))
-    file = sign_bundle(contents, key, certificate)
+    with terminal.writing(contents.path):
+        file = sign_bundle(contents, key, certificate)
     about = f"{contents.contract.name} version {contents.contract.version}"
     terminal.output().print(f"{about} is signed: {file}", highlight=False, markup=False, soft_wrap=True)

@@ -269,7 +269,8 @@ def _measure(
     if write:
         now = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
         evaluations = (*loaded.contract.evaluations, *evaluations_of(table, now))
-        write_contract(loaded.path, loaded.contract.model_copy(update={"evaluations": evaluations}))
+        with terminal.writing(loaded.path):
+            write_contract(loaded.path, loaded.contract.model_copy(update={"evaluations": evaluations}))
         note(f"written into {loaded.path / 'contract.json'}")
     return table
 

@@ -43,6 +43,8 @@ def write_onnx(graph: PolicyGraph, example: Inputs, file: Path) -> None:
     try:
         _export(graph, example, file, dynamo=False)
         _finish(file, graph, example)
+    except OSError:  # of the file, such as a full disk
+        raise
     except Exception as first:  # torch.onnx, onnx and onnxruntime raise several unrelated types
         try:
             _export(graph, example, file, dynamo=True)

@@ -6,6 +6,7 @@ torch.export.
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,9 +36,11 @@ def write_torchscript(graph: PolicyGraph, example: Inputs, file: Path) -> list[s
                 traced = torch.jit.trace(  # type: ignore[no-untyped-call]  # torch annotates it only in part
                     graph, tuple(torch.from_numpy(example[name]) for name in graph.input_names), check_trace=False
                 )
-                torch.jit.freeze(traced).save(str(file))
+                # To memory first: torch ends the process if it cannot write a file, as on a full disk.
+                torch.jit.save(torch.jit.freeze(traced), content := io.BytesIO())
         except Exception as error:  # the network's own forward may raise anything
             raise UnsupportedError(f"the network cannot be traced: {first_line(error)}{raised_at(error)}") from error
+    file.write_bytes(content.getbuffer())
     return frozen_by_tracing(caught)
 
 
