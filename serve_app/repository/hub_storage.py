@@ -102,9 +102,9 @@ class HubStorage:
                 file = hf_hub_download(self._repository, name, revision=found.commit_hash, **given)
             except RemoteEntryNotFoundError:
                 raise FileNotFoundError(f"{self.uri}/{name}") from None
-            except LocalEntryNotFoundError as error:
+            except LocalEntryNotFoundError:
                 raise UnavailableError(
-                    f"{self.uri}/{name} cannot be reached, and is not in the hub's cache here ({first_line(error)})"
+                    f"{self.uri}/{name} is not in the hub's cache here (HF_HOME), and {_no_answer()}"
                 ) from None
         return Path(file), found.commit_hash
 
@@ -116,7 +116,7 @@ class HubStorage:
     @contextlib.contextmanager
     def _named(self, name: str) -> Iterator[None]:
         """Turn the hub's errors into UnavailableError, with the place."""
-        from huggingface_hub.errors import RepositoryNotFoundError, RevisionNotFoundError
+        from huggingface_hub.errors import HfHubHTTPError, RepositoryNotFoundError, RevisionNotFoundError
 
         place = f"{self.uri}/{name}".rstrip("/")
         try:
@@ -130,5 +130,18 @@ class HubStorage:
                 f"{place}: there is no such repository, or it is not open to this environment's token (HF_TOKEN, or "
                 "`hf auth login`)"
             ) from None
-        except Exception as error:  # huggingface_hub, its HTTP client and Xet raise several unrelated types
-            raise UnavailableError(f"{place} cannot be reached or written: {first_line(error)}") from None
+        except HfHubHTTPError as error:
+            reason = first_line(error)
+            if error.response.status_code in (401, 403):
+                reason = "the hub refuses this: set HF_TOKEN, or run `hf auth login`, with a token that may write there"
+            raise UnavailableError(f"{place} cannot be read or written: {reason}") from None
+        except Exception as error:  # its HTTP client and Xet raise several unrelated types
+            raise UnavailableError(f"{place} cannot be reached: {_no_answer()} ({first_line(error)})") from None
+
+
+def _no_answer() -> str:
+    from huggingface_hub import constants
+
+    if constants.HF_HUB_OFFLINE:
+        return "HF_HUB_OFFLINE is set: unset it to ask the hub"
+    return f"{constants.ENDPOINT} does not answer: check the network, and HF_ENDPOINT if it is set"

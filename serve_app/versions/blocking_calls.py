@@ -70,8 +70,8 @@ class BlockingCalls:
                     return returned.result()
                 left_s -= SILENCE_S
                 if left_s > 0:
-                    logger.warning("waiting for %s (%.0f s)", what, self._timeout_s - left_s)
+                    logger.warning("%s has taken %.0f s so far", what, self._timeout_s - left_s)
         finally:
             returned.cancel()  # if it has not returned, its result is no longer wanted
         took = f"{what} took longer than {self._timeout_s:g} s"
-        raise UnavailableError(f"{took} and was given up: does the file system or the object storage answer?")
+        raise UnavailableError(f"{took} and was given up: check the disk, or the network to the storage")

@@ -62,7 +62,7 @@ class VersionLoader:
 
     async def look(self) -> Listing:
         """Return what the repository holds now. Raises UnavailableError when that takes too long."""
-        return await self._calls.run("looking through the policies' folders", self._repository.look)
+        return await self._calls.run("listing the policies", self._repository.look)
 
     async def load(self, key: Loadable) -> Policy:
         """Load and prove a version unless it is in memory.

@@ -617,7 +617,7 @@ def test_while_a_file_system_does_not_answer_all_else_goes_on(
 
 @pytest.mark.parametrize(
     ("name", "patience", "sentence"),
-    [("contract.json", {"timeout_s": 0.5}, "looking through the policies' folders took longer than 0.5 s and was"),
+    [("contract.json", {"timeout_s": 0.5}, "listing the policies took longer than 0.5 s and was"),
      ("policy.onnx", {"timeout_s": 0.5}, "loading policy 'ur5' version 10 took longer")],
     indirect=["patience"],
 )  # fmt: skip
@@ -692,7 +692,7 @@ def test_a_start_does_not_wait_in_silence_for_a_file_system_that_hangs(
     root: Path, stall: Callable[[Path], Stalled]
 ) -> None:
     stalled = stall(root / "ur5" / "1" / "contract.json")
-    with pytest.raises(UnavailableError, match=r"looking through the policies' folders took longer than 0.3 s"):
+    with pytest.raises(UnavailableError, match=r"listing the policies took longer than 0.3 s"):
         load_served([root], ServedConfig(), ServerSettings(load_timeout_s=0.3))
     stalled.go_on.set()
 

@@ -273,6 +273,28 @@ def test_what_cannot_be_served_is_refused_in_a_sentence(
     assert words in " ".join((said.stderr + said.stdout).split()) and "Traceback" not in said.stderr
 
 
+@pytest.mark.parametrize(
+    ("variables", "words"),
+    [
+        ({"HF_TOKEN": ""}, "hf://owner/arm cannot be read or written: the hub refuses this: set HF_TOKEN, or run"),
+        ({"HF_ENDPOINT": "http://127.0.0.1:9"}, "http://127.0.0.1:9 does not answer: check the network, and HF_ENDP"),
+        ({"HF_HUB_OFFLINE": "1"}, "hf://owner/arm cannot be reached: HF_HUB_OFFLINE is set: unset it to ask the hub"),
+    ],
+)
+def test_a_publication_without_token_or_network_names_it(
+    variables: dict[str, str], words: str, hub: Hub, ur5: Path, tmp_path: Path
+) -> None:
+    said = rlservo(hub, tmp_path, "publish", ur5, "hf://owner/arm", **variables)
+    assert (said.returncode, said.stdout) == (1, "") and words in said.stderr
+
+
+def test_what_is_not_cached_is_not_served_offline(hub: Hub, tmp_path: Path) -> None:
+    (port,) = free_ports(1)
+    said = rlservo(hub, tmp_path, "serve", "hf://owner/arm", "--port", port, HF_HUB_OFFLINE="1")
+    words = "hf://owner/arm/index.json is not in the hub's cache here (HF_HOME), and HF_HUB_OFFLINE is set"
+    assert said.returncode == 1 and words in said.stderr
+
+
 def test_a_pinned_revision_is_not_published_to(hub: Hub, ur5: Path, tmp_path: Path) -> None:
     said = rlservo(hub, tmp_path, "publish", ur5, "hf://owner/arm@v1")
     assert said.returncode == 2 and "hf://owner/arm@v1 is one revision: publish to hf://owner/arm" in said.stderr

@@ -848,7 +848,7 @@ def test_a_wait_is_said(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.Mo
 
     async def run() -> None:
         waiting = asyncio.create_task(BlockingCalls(60).run("loading policy 'ur5'", go_on.wait))
-        await until(lambda: "waiting for loading policy 'ur5'" in caplog.text)
+        await until(lambda: "loading policy 'ur5' has taken" in caplog.text)
         go_on.set()
         assert await waiting
 
