@@ -273,8 +273,8 @@ class Promotion:
             if policy.get(use) == ours or (use == "shadow" and policy.get("version") == version):
                 self._change(use, {"version": None})
         policy = self._served()
-        production, canary = _shown(policy.get("version")), _shown(policy.get("canary"))
-        return Outcome(outcome, f"{why}; {production} is in production, the canary is {canary}")
+        canary = f"canary {_shown(policy['canary'])}" if policy.get("canary") else "no canary"
+        return Outcome(outcome, f"{why}; {_shown(policy.get('version'))} is in production, with {canary}")
 
     # Ask the servers.
 

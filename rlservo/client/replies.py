@@ -46,8 +46,14 @@ def decode_error(url: str, status: int, content: bytes) -> RlservoError:
         error = None
     if error is not None:
         return error
-    if status == 404:  # Ray Serve's own answer while the application is being deployed
-        return UnavailableError(f"{url} answered 404 with {excerpt(content)}: no rlservo server is running there yet")
+    if status == 404:  # also Ray Serve's own answer while the application is being deployed
+        return UnavailableError(
+            f"{url} answered 404 with {excerpt(content)}: no rlservo server is there yet, or a proxy has another prefix"
+        )
+    if status in (502, 503):
+        return UnavailableError(
+            f"{url} answered {status} with {excerpt(content)}: a proxy is there, but no server behind it answers"
+        )
     return _class_of_status(status)(f"{url} answered {status} with {excerpt(content)}: is it an rlservo server?")
 
 

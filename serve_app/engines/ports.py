@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import socket
 from typing import Any
 
@@ -40,6 +41,8 @@ def _check_route(family: int, address: Any) -> None:
 def _why_not(host: str, port: int, option: str, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         holder = port_holder(port)
+        if holder is not None and holder[0] == os.getpid():
+            return f"port {port} is this server's --port already: choose another one with {option}"
         by = "" if holder is None else f" by '{holder[1]}' (process {holder[0]})"
         return f"port {port} on {host} is in use{by}: stop that process, or choose another port with {option}"
     if error.errno == errno.ENETUNREACH:

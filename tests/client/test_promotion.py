@@ -222,7 +222,7 @@ def test_a_good_canary_is_promoted_and_the_log_has_its_figures(run: Any, server:
     assert outcome.outcome == PROMOTED, outcome
     assert seen[0] == ("1", ("2", 0.5), "2")
     assert server.state == ("2", None, None)
-    assert outcome.why.endswith("2 is in production, the canary is none")
+    assert outcome.why.endswith("2 is in production, with no canary")
     assert promotion.events() == ["start", "check", "check", "check", "decision", "end"]
     assert 100 < promotion.answered("2") < 230 and promotion.answered("1") + promotion.answered("2") == 330
     errors, slow, apart = promotion.entries[-3]["figures"]
@@ -778,7 +778,7 @@ def test_ctrl_c_rolls_back(run: Any, server: Server) -> None:
         raise KeyboardInterrupt
 
     outcome = run()(lambda: server.ask(200), interrupt)
-    assert outcome.outcome == INTERRUPTED and outcome.why.endswith("1 is in production, the canary is none")
+    assert outcome.outcome == INTERRUPTED and outcome.why.endswith("1 is in production, with no canary")
     assert server.state == ("1", None, None)
 
 
