@@ -90,8 +90,9 @@ class _Last:
 class _SingleAgent(SingleAgentEpisode):
     __slots__ = ()
 
-    def __getattribute__(self, name: str) -> Any:
-        return _attribute(name, super().__getattribute__(name))
+    def __getattribute__(self, name: str) -> Any:  # no more calls than needed: RLlib reads ids millions of times
+        value = super().__getattribute__(name)
+        return value if name in OF_NO_STEP else _attribute(name, value)
 
     def __len__(self) -> int:
         _attribute("__len__", None)
@@ -102,7 +103,8 @@ class _MultiAgent(MultiAgentEpisode):
     __slots__ = ()
 
     def __getattribute__(self, name: str) -> Any:
-        return _attribute(name, super().__getattribute__(name))
+        value = super().__getattribute__(name)
+        return value if name in OF_NO_STEP else _attribute(name, value)
 
     def __len__(self) -> int:
         _attribute("__len__", None)
@@ -113,7 +115,7 @@ def _attribute(name: str, value: Any) -> Any:
     """Return an attribute of an episode for the code that reads it, two frames above; RLlib's own may read all."""
     frame: Any = inspect.currentframe()
     reader = frame.f_back.f_back
-    if name in OF_NO_STEP or str(reader.f_globals.get("__name__")).partition(".")[0] in ("ray", "rlservo"):
+    if str(reader.f_globals.get("__name__")).partition(".")[0] in ("ray", "rlservo"):
         return value
     if name in OF_THE_LAST:
         return _Last(name, value)
