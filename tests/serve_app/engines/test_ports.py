@@ -11,7 +11,5 @@ from rlservo.serve_app.engines.ports import listen
 def test_a_port_given_twice_is_not_another_process() -> None:
     with listen("127.0.0.1", 0) as first:
         port = first.getsockname()[1]
-        with pytest.raises(
-            UsageError, match=f"^port {port} is this server's --port already: choose another"
-        ):
+        with pytest.raises(UsageError, match=f"^port {port} is this server's --port already: choose another"):
             listen("127.0.0.1", port, option="--grpc-port")
