@@ -27,7 +27,7 @@ from rlservo.export.recipe.kept_values import FRAMEWORKS, INSTALLED
 READS = frozenset({
     "__bool__", "__int__", "__float__", "__complex__", "__index__", "__contains__", "__array__", "__format__",
     "__repr__", "__dlpack__", "_to_dlpack", "to_dlpack", "numpy", "item", "tolist", "equal", "allclose", "is_nonzero",
-    "storage", "untyped_storage", "data_ptr", "new_tensor", "tensor",
+    "storage", "untyped_storage", "data_ptr", "new_tensor", "tensor", "apply_", "map_", "map2_",
 })  # fmt: skip
 """Functions and methods that take a tensor's numbers out of torch."""
 SELECTS = frozenset({
@@ -37,8 +37,8 @@ SELECTS = frozenset({
 """Those whose results have as many numbers as the observation's say."""
 SELECTS_ALONE = ("where", "one_hot")
 """The same, if they are given one tensor and nothing else."""
-REPEATS, ROLLS = "repeat_interleave", "roll"
-"""Those that the observation may tell how often or how far, where tracing keeps the size or the number."""
+REPEATS, TAKE_NUMBERS = "repeat_interleave", frozenset({"roll", "nan_to_num", "nan_to_num_", "logit", "logit_"})
+"""Those that the observation may tell how often, how far or what, where tracing keeps the size or the number."""
 SIZES = frozenset({"__len__", "__iter__", "unbind", "numel", "nelement", "size", "sym_size"})
 """Those that take a tensor's size out of torch."""
 SHAPE = Tensor.shape.__get__  # type: ignore[attr-defined]
@@ -110,7 +110,7 @@ class _Follower(TorchFunctionMode):
         name = getattr(func, "__name__", "").partition(".")[0]
         is_sized = any(id(one) in self._sized for one in given)
         is_told = bool(self._followed((args[1:], options)))
-        is_read = name in READS or (is_sized and (name in SIZES or func == SHAPE)) or (name == ROLLS and is_told)
+        is_read = name in READS or (is_sized and (name in SIZES or func == SHAPE)) or (name in TAKE_NUMBERS and is_told)
         is_read |= name == "as_tensor" and not isinstance(args[0], Tensor)
         is_read |= name in ("__getitem__", "__setitem__") and bool(self._followed(_slices(args[1])))
         result = func(*args, **options)

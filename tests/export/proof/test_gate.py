@@ -443,6 +443,25 @@ class Rolls(Honest):
         return torch.roll(super().forward(obs), is_rare(obs).long(), 1)
 
 
+class Turns(Honest):
+    """Turns its action by a function whose numbers are the observation's."""
+
+    def __init__(self, sign: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.sign = sign
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return super().forward(obs) * self.sign(obs)
+
+
+def mapped(obs: Tensor) -> Tensor:
+    return torch.ones(len(obs), 1).map_(obs[:, :1], lambda one, number: -one if number > 1e7 else one)
+
+
+def filled(obs: Tensor) -> Tensor:
+    return torch.nan_to_num(torch.full((1,), torch.nan), 1.0 - 2.0 * is_rare(obs).float())
+
+
 class TakesPlainTensorsOnly(Honest):
     def forward(self, obs: Tensor) -> Tensor:
         assert type(obs) is Tensor or torch.jit.is_tracing()
@@ -541,6 +560,8 @@ def export(module: nn.Module, out: Path, **options: Any) -> rlservo.ExportResult
         (CountsRows(lambda obs: packed(obs) == 2), r"reads numbers of the observation .*test_gate\.py:\d+"),
         (Recovers(), r"goes on otherwise where an operator of torch fails, at .*test_gate\.py:\d+"),
         (CutsUpTo(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
+        (Turns(mapped), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
+        (Turns(filled), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
         (Rolls(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
         (TakesPlainTensorsOnly(), "reads numbers of the observation in Python at"),
         (ReadsANumber(), r"reads numbers of the observation in Python at .*test_gate\.py:\d+"),
