@@ -19,7 +19,7 @@ class PolicyOptions(BaseModel):
 
     out_of_bounds: Literal["accept", "warn", "clip", "refuse"] = "warn"
     """Treatment of an observation outside the space's bounds: use it as it is, use it and warn, clip it and warn, or
-    refuse it. RLlib itself accepts it; a policy has rarely been trained there."""
+    refuse it. RLlib itself accepts it, but few policies were trained on such observations."""
 
     max_action_step: Step | tuple[Step | None, ...] | dict[str, Step | tuple[Step | None, ...]] | None = None
     """Largest change of each action element from the last action, in the action's unit: one number, one per element in

@@ -55,7 +55,7 @@ class ServerSettings(BaseModel):
 
     max_connections_per_address: int = Field(1024, ge=0)
     """Largest number of connections from one client address to a process of the embedded server, of 4096 in
-    total; further ones get 429, many more are closed at once. 0: no bound, for a server behind a proxy."""
+    total; further ones get 429, or are closed at once if they are many. 0: no bound, for a server behind a proxy."""
 
     trusted_proxies: str = ""
     """Addresses, separated by commas, of proxies in front of the embedded server whose `X-Forwarded-For` names the
@@ -83,14 +83,14 @@ class ServerSettings(BaseModel):
     machines can reach accepts any name unless some are given here: a web page has no key."""
 
     default_policy: str | None = None
-    """Policy of a WebSocket at `/`, where openpi's clients connect; if there is one policy, that one. Also set by
+    """Policy of a WebSocket at `/`, where openpi's clients connect; by default the only policy. Also set by
     `rlservo serve --default-policy`."""
 
     log_file: str | None = None
     """Append the log to this file; without one it goes to standard error, which Ray keeps in its session folder."""
 
     audit_file: str | None = None
-    """Also append a line for every command of administration, carried out or refused, to this file. All processes of a
+    """Also append a line for every administrative command, carried out or refused, to this file. All processes of a
     machine append to the same one."""
 
     log_level: Literal["debug", "info", "warning", "error"] = "info"
