@@ -85,7 +85,7 @@ def wait_until(condition: Callable[[], bool], what: Callable[[], str] | str, tim
         waited_s = time.monotonic() - began
         reason = what if isinstance(what, str) else what()
         if waited_s > timeout_s:
-            raise RobotError(f"{reason}, for {timeout_s:g} s")
+            raise RobotError(f"waited {timeout_s:g} s: {reason}")
         if waited_s > SAID_AFTER_S and not said:
             said = True
             log.warning("still waiting: %s", reason)
