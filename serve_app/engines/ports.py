@@ -42,7 +42,7 @@ def _why_not(host: str, port: int, option: str, error: OSError) -> str:
     if error.errno == errno.EADDRINUSE:
         holder = port_holder(port)
         if holder is not None and holder[0] == os.getpid():
-            return f"port {port} is this server's --port already: choose another one with {option}"
+            return f"port {port} is in use by this process itself, as by --port: choose another one with {option}"
         by = "" if holder is None else f" by '{holder[1]}' (process {holder[0]})"
         return f"port {port} on {host} is in use{by}: stop that process, or choose another port with {option}"
     if error.errno == errno.ENETUNREACH:
